@@ -80,9 +80,8 @@ class SequenceRecipe(DatasetRecipe):
     """Number of steps that the network reads when it acts; the length of a training window by
     default and at most."""
     full_windows: bool = False
-    """Whether windows that would pass their episode's end begin earlier. With windows as long as
-    episodes, all then begin with the first step, as they do when the agent acts; otherwise one of
-    as many as there are steps."""
+    """Whether windows that would pass their episode's end begin earlier, so that fewer are padded.
+    Windows as long as episodes then all begin with the first step, as when the agent acts."""
     batch_size: Batch = 64
     """Windows in one gradient step."""
     learning_rate: Rate = 1e-4

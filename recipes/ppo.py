@@ -220,7 +220,7 @@ class Minibatch(NamedTuple):
     """N sequences of T consecutive steps, and the frames that the network reads in them."""
 
     steps: TensorDictBase
-    """What was collected in each step, "is_init", "advantage" and "value_target", [N, T]."""
+    """The entries of ``step_keys``, and "is_init", of each step, [N, T]."""
     frames: list[Tensor]
     """The frames of each observation, each once, [R, *observation_shape]."""
     windows: Windows

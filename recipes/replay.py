@@ -71,8 +71,8 @@ class ReplayRecipe(OnlineRecipe, SamplesRecipe):
     (with ``--init-from``, also in those of the other run), and to clip them to +-10; only for
     arrays of floats. Entries that are constant in these steps have a deviation of 1."""
     storage_device: Device = "cpu"
-    """Device of the stored data, from which batches are moved to the networks; those on the CPU
-    store data there, too. "cuda" is faster if all data fit on the GPU."""
+    """Device of the stored data, from which batches are moved to the networks; the CPU if these are
+    there. "cuda" is faster if all data fit on the GPU."""
     log_interval: Steps = 1000
     """Environment steps between rows of metrics."""
 

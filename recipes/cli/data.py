@@ -87,8 +87,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
             "--gaps",
             choices=["error", "cut"],
             default="error",
-            help="refuse data where an episode continues with another observation than its next "
-            "one, or end the episode there",
+            help="refuse data with gaps in next observations or timestamps, or end the episode "
+            "there",
         )
         command.add_argument("--directory", type=Path, help="folder for temporary files")
     convert.add_argument("target", help="HDF5 file, Minari folder (/PATH-v0 or ./PATH-v0) or name")

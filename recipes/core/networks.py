@@ -122,8 +122,8 @@ def make_cloning_policy(
 
     Bounded actions have a Gaussian whose mean is kept within the bounds by a tanh, and whose
     standard deviation does not depend on the state (Kostrikov et al., arXiv 2110.06169, and its
-    authors' code). A squashed Gaussian would have an infinite density at the bounds, where data
-    sets have many actions. Other actions use the head of :func:`~torchrl_tit.modules.make_actor`.
+    authors' code). A squashed Gaussian's density is 0 at the bounds, where data sets have many
+    actions. Other actions use the head of :func:`~torchrl_tit.modules.make_actor`.
 
     Args:
         backbone: the backbone.

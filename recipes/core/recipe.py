@@ -233,13 +233,13 @@ class DatasetRecipe(Recipe):
     max_episode_steps: Steps | None = None
     """Time limit of the task, for data files that do not record it; see docs/datasets.md."""
     gaps: Gaps = "error"
-    """What to do if the next observation of a step in a data file is not the observation that
-    follows: "error" refuses the data, "cut" ends the episode there."""
+    """What to do at gaps in a data file's next observations or timestamps: "error" refuses the
+    data, "cut" ends the episode there."""
     batch_size: Batch = 64
     """Batch size of a gradient step."""
     storage_device: Device = "cpu"
-    """Device of the stored data, from which batches are moved to the networks; those on the CPU
-    store data there, too. "cuda" is faster if all data fit on the GPU."""
+    """Device of the stored data, from which batches are moved to the networks; the CPU if these are
+    there. "cuda" is faster if all data fit on the GPU."""
     log_interval: Steps = 100
     """Gradient steps between rows of metrics."""
     checkpoint_interval: Steps = 1000

@@ -51,7 +51,7 @@ class Run:
         initial_weights/   the weights that it took from another run, if any
         versions.json      the versions of Python and packages that it ran with
         imports.json       the user's own modules that it was started with
-        metrics.csv        one row of numbers per batch
+        metrics.csv        one row of numbers per log_interval
         tensorboard/       the same for TensorBoard
         checkpoints/       numbered by step; the newest complete one is loaded
         learning_curve.png

@@ -169,6 +169,9 @@ def test_parts_of_episodes_are_no_sequences() -> None:
     for part in (rest, held_out):
         with pytest.raises(DatasetError, match="nothing can be drawn"):
             SequenceStorage(part, 1)
+    for fraction in (-1.0, 0.0, 1.0, 1.5):
+        with pytest.raises(ValueError, match=r"fraction must be a probability in \(0, 1\)"):
+            split_episodes(episodes, fraction, seed=0)
 
 
 def test_returns_to_go_of_long_data_stay_exact() -> None:

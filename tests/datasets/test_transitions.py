@@ -30,6 +30,7 @@ from torchrl_tit.datasets import (
     write_minari,
 )
 from torchrl_tit.datasets.checks import check_actions
+from torchrl_tit.datasets.transitions import episodes_from_transitions
 
 
 def fields_of(data: Episodes) -> Transitions:
@@ -275,7 +276,8 @@ def test_what_is_large_and_not_needed_is_left_out(tmp_path: Path, rolled: Transi
     data = read_hdf5(path)
 
     assert data.attributes == {"env_id": "Hopper-v5", "authors": ["A", "B"], "long": 0.5}
-    assert data.left_out == ("and others", "data/rewards", "elsewhere")
+    omitted = ("and others", "attribute names", "attribute none", "data/rewards", "elsewhere")
+    assert data.left_out == omitted
 
 
 def test_attributes_of_fields_are_said_to_be_left_out(tmp_path: Path, rolled: Transitions) -> None:
@@ -404,3 +406,14 @@ def test_selected_and_joined_episodes_keep_their_rows(arrays: Transitions) -> No
     joined = join_episodes(parts)
     assert (joined.rows == selected.rows).all()
     assert torch.equal(joined.lengths, selected.lengths)
+
+
+@pytest.mark.parametrize("lengths", [[2, 2], [3, 5], [6, 0]])
+def test_lengths_that_are_not_those_of_the_rows_are_refused(lengths: list[int]) -> None:
+    zeros, flags = np.zeros((6, 1)), np.zeros(6, bool)
+    settings: dict[str, Any] = {"lengths": np.array(lengths), "source": "a.hdf5"}
+    fields = {"observations": zeros, "actions": zeros, "rewards": zeros[:, 0], "terminals": flags}
+    with pytest.raises(DatasetError, match="lengths must be positive, add up to the 6 rows, and"):
+        episodes_from_transitions({**fields, "timeouts": flags}, **settings)
+    with pytest.raises(DatasetError, match="and come with 'timeouts'"):
+        episodes_from_transitions(fields, source="a.hdf5", lengths=np.array([2, 4]))

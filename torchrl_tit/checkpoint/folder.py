@@ -138,8 +138,8 @@ def load_checkpoint(folder: str | os.PathLike[str], step: int | None = None) -> 
     paths = _checkpoints(folder)
     if not paths:
         raise CheckpointNotFoundError(
-            f"there is no checkpoint in {folder}: the run was stopped before its first one, "
-            "or this is not a run's checkpoint folder"
+            f"there is no checkpoint in {folder}: it was removed, the run was stopped before its "
+            "first one, or this is not a run's checkpoint folder"
         )
     if step is None:
         step = max(paths)

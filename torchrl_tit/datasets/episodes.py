@@ -17,6 +17,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_tit.datasets.checks import DatasetError
+from torchrl_tit.settings.checks import checked_arguments
+from torchrl_tit.settings.numbers import Inside, Seed
 
 Unfinished = Literal["keep", "drop"]
 
@@ -238,10 +240,11 @@ def select_episodes(episodes: Episodes, index: Tensor) -> Episodes:
     )
 
 
-def split_episodes(episodes: Episodes, fraction: float, seed: int) -> tuple[Episodes, Episodes]:
+@checked_arguments
+def split_episodes(episodes: Episodes, fraction: Inside, seed: Seed) -> tuple[Episodes, Episodes]:
     """Holds some of the finished episodes out.
 
-    If a single one is finished, its last part is held out, with a warning.
+    If fewer than two are finished, the last part of one is held out, with a warning.
 
     Args:
         episodes: the data.
@@ -253,7 +256,8 @@ def split_episodes(episodes: Episodes, fraction: float, seed: int) -> tuple[Epis
         The episodes to learn from, unfinished ones among them, and those that are held out.
 
     Raises:
-        DatasetError: if the only finished episode has a single step.
+        ValueError: if ``fraction`` or ``seed`` is out of its bounds.
+        DatasetError: if fewer than two episodes are finished, and that one has a single step.
 
     Example:
         >>> from torchrl_tit.datasets import episodes_from_arrays

@@ -73,6 +73,8 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
             others = set(array_names(file)) - set(FIELDS)
             fields: dict[str, Any] = dict.fromkeys(x if x != CUTS else f"array {x}" for x in others)
             attributes = _attributes(file)
+            for name in set(file.attrs) - set(attributes):
+                fields[f"attribute {name}"] = None
         for name in (*FIELDS, TIMESTAMPS):
             if isinstance(field := find(source, file, name), h5py.Dataset):
                 fields[name] = field

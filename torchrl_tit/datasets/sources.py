@@ -50,8 +50,8 @@ def load_episodes(
             name registered with Gymnasium, such as "Hopper-v5", or the spaces. Not checked if None.
         max_episode_steps: the time limit of an HDF5 file without "timeouts": see
             :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`.
-        gaps: what to do where "next_observations" of an HDF5 file is not the observation of the
-            next row: see the same function.
+        gaps: what to do at gaps in an HDF5 file's "next_observations" or "timestamps": see the same
+            function.
         dtype: the dtype for floats; None keeps that of each field. Integers stay integers.
         directory: a folder on a disk with room for the rows; no files remain there. By default the
             system's folder for temporary files.

@@ -254,9 +254,9 @@ class SequenceStorage(EpisodeStorage):
 
     An item has "observation" [K, *obs], "action" [K, *action] (int64 if it is discrete),
     "return_to_go" [K, 1], "timestep" int64 [K] and "mask" bool [K], which is False at padding.
-    A uniformly drawn index selects an episode with a probability proportional to its length, and a
-    uniformly distributed start within it. Unfinished episodes and parts of others are left out,
-    because the rest of their returns is not known.
+    A uniformly drawn index selects an episode with a probability proportional to its length, and
+    without ``full`` a uniformly distributed start within it. Unfinished episodes and parts of
+    others are left out, because the rest of their returns is not known.
 
     Args:
         episodes: the data.

@@ -121,8 +121,8 @@ def episodes_from_transitions(
             :func:`~torchrl_tit.datasets.episodes.memory_mapped_rows`.
         attributes: metadata of the source. If they contain "env_id", the name of the task, it must
             be that of ``task``, except for the version.
-        lengths: number of steps of each episode, if the source says so; int64 [E]. Episodes then
-            end there only, also without a flag.
+        lengths: number of steps of each episode, if the source says so; int64 [E], in all N; needs
+            ``timeouts``. Episodes then end there only, also without a flag.
 
     Returns:
         The episodes. The last one may be unfinished.
@@ -156,6 +156,12 @@ def episodes_from_transitions(
             raise DatasetError(source, f"{problem} in 'timeouts'{hint}.")
         ends[-1] = True
     else:
+        if "timeouts" not in fields or min(lengths) < 1 or sum(lengths) != reader.num_rows:
+            problem = (
+                f"lengths must be positive, add up to the {reader.num_rows} rows, and come with "
+                f"'timeouts', but add up to {sum(lengths)}."
+            )
+            raise DatasetError(source, problem)
         truncated, cuts = reader.flags("timeouts"), np.zeros_like(terminated)
         ends = np.zeros_like(terminated)
         ends[lengths.cumsum() - 1] = True

@@ -132,9 +132,9 @@ class Backbone(ActingModule):
 
     Raises:
         ValueError: if the number of keys does not match the network's inputs and outputs,
-            ``every_frame`` is set for a history encoder that only encodes the newest frame, or the
-            padding is unknown; in ``forward``, if the padding makes other histories than the stored
-            ones.
+            ``every_frame`` is set for a history encoder that only encodes the newest frame, the
+            padding is unknown, or a state is to be carried for agents; in ``forward``, if steps are
+            not consecutive, or the padding makes other histories than the stored ones.
         KeyError: in ``forward``, if the tensordict lacks one of the entries.
 
     Example:

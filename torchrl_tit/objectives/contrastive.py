@@ -40,7 +40,7 @@ def contrastive_prediction_loss(
         The mean over the masked steps, float []; 0 if none is masked.
 
     Raises:
-        ValueError: if shapes do not match, or the temperature is not positive.
+        ValueError: if shapes or the mask's dtype do not match, or the temperature is not positive.
 
     Example:
         >>> encodings, mask = torch.eye(6).view(2, 3, 6), torch.tensor([[True, False, False]] * 2)

@@ -61,8 +61,8 @@ class ContinuousCQLLoss(CQLLoss):
         actor_network: policy whose distribution has a ``deterministic_sample``, such as that of
             :func:`~torchrl_tit.modules.make_squashed_actor`.
         qvalue_network: reads any keys (those under "next" for the target) and the action, and
-            writes "state_action_value", float [..., 1]. Either two critics, which keep their
-            initial weights, or one, which TorchRL duplicates and reinitializes.
+            writes "state_action_value", float [..., 1]. A list of two critics, which keep their
+            initial weights, or one module, which TorchRL duplicates and reinitializes.
         action_spec: bounds of an action, a ``Bounded`` spec of shape [A].
         min_q_weight: weight w of the conservative term.
         num_random: number m of samples of each kind.

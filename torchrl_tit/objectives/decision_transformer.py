@@ -29,7 +29,7 @@ class MaskedDTLoss(DTLoss):
         reduction: how to reduce the losses of the steps; None, as in TorchRL, is "mean".
 
     Returns:
-        In ``forward``, a tensordict with "loss", float [].
+        In ``forward``, a tensordict with "loss", float [] unless ``reduction`` is "none".
 
     Raises:
         ValueError: if there is no such ``loss_function`` or ``reduction``.

@@ -29,8 +29,8 @@ class HideEntries(ObservationTransform):
 
     Args:
         hidden: indices of the entries to remove.
-        in_keys: keys of the observations, which may be nested. One of shape [..., D] becomes
-            [..., D - len(hidden)].
+        in_keys: list of keys of the observations, which may be nested. One of shape [..., D]
+            becomes [..., D - len(hidden)].
 
     Raises:
         ValueError: if ``hidden`` names an entry twice; or, when the specs of an environment with

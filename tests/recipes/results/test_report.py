@@ -96,7 +96,7 @@ def test_what_a_page_says_of_one_run(alone):
         "torch 2.13.0",
         "No film of enhanced-tit: there is no checkpoint.",
         "How far the policy moved from the one that collected the batch",
-        "Healthy: It is between 0.003 and 0.02.",
+        "Healthy: It is between 0.001 and 0.03.",
         "If it is larger, choose a lower learning_rate",
         "These are the same in all rows: epochs 10.",
         "No metric was outside its healthy range",
@@ -147,7 +147,7 @@ def test_metrics_that_are_not_healthy_are_pointed_out(tmp_path):
     report(tmp_path / "run", "--out", tmp_path / "a.html", "--no-pictures")
     page = Page(tmp_path / "a.html")
     found = page.source.partition("outside their healthy range")[2].partition("</ul>")[0]
-    assert "kl_approx</code> was above 0.02 in 33% of the batches" in found
+    assert "kl_approx</code> was above 0.03 in 33% of the batches" in found
     assert "explained_variance" not in found
     assert "gradient_norm" not in found
     assert "has no results: no evaluated run in" in page.text
