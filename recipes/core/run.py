@@ -195,8 +195,8 @@ class Run:
         """Returns the lengths that the run's schedules followed before the recipe's.
 
         Returns:
-            A pair for each time that :meth:`lengthen` changed the length of a run that had begun
-            and has schedules: the step until which the run had the earlier length, and that length.
+            A pair for each length, of a run that has schedules, with which it was trained before
+            :meth:`lengthen` changed it: the step until which it had that length, and the length.
 
         Raises:
             ValueError: if their file is damaged.

@@ -156,10 +156,11 @@ def episodes_from_transitions(
             raise DatasetError(source, f"{problem} in 'timeouts'{hint}.")
         ends[-1] = True
     else:
-        if "timeouts" not in fields or min(lengths) < 1 or sum(lengths) != reader.num_rows:
+        total, positive = lengths.sum(), (lengths > 0).all()
+        if "timeouts" not in fields or not positive or total != reader.num_rows:
             problem = (
                 f"lengths must be positive, add up to the {reader.num_rows} rows, and come with "
-                f"'timeouts', but add up to {sum(lengths)}."
+                f"'timeouts', but add up to {total}."
             )
             raise DatasetError(source, problem)
         truncated, cuts = reader.flags("timeouts"), np.zeros_like(terminated)
