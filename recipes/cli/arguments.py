@@ -27,7 +27,7 @@ IMPORT_HELP = (
 )
 
 _MODULE_AND_NAME = re.compile(r"(?:--[\w.-]+=)?([A-Za-z_][\w.]*):[A-Za-z_][\w/-]*(?:\(.*\))?")
-_OPTION = re.compile(r"--(?:no-)?([A-Za-z][\w.-]*)")
+_OPTION = re.compile(r"--(?:no-)?([A-Za-z][^=]*)")
 
 _OURS = (str(Path(torchrl_tit.__file__).parent), str(Path(__file__).parents[1]))
 

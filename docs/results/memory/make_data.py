@@ -1,4 +1,4 @@
-"""Writes tmaze-50, -100 and -500.hdf5, experts in corridors of 50, 100 and 500 steps.
+"""Writes tmaze-10, -50, -100 and -500.hdf5, experts in corridors of so many steps.
 
 Writes tmaze-100-mixed.hdf5, too, in which every other episode ends at the wrong side.
 """
@@ -25,6 +25,7 @@ def play(length: int, episodes: int, wrong_turns: bool = False) -> list[tuple]:
 
 
 for name, rows in {
+    "10": play(10, 200),
     "50": play(50, 200),
     "100": play(100, 200),
     "100-mixed": play(100, 400, wrong_turns=True),
