@@ -33,7 +33,7 @@ import io
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from fnmatch import fnmatchcase
 from functools import cache
 from itertools import pairwise
@@ -170,8 +170,8 @@ def _values(runs: Runs) -> list[float]:
     return runs.numbers("mean" if runs.runs else "evaluation")
 
 
-def _normalized(runs: Runs) -> dict[Any, list[float]]:
-    """The normalized returns of each task; a row of a CSV file has the task's name."""
+def _normalized(runs: Runs, tasks: Container[Any] | None = None) -> dict[Any, list[float]]:
+    """The normalized returns of each of the tasks; a row of a CSV file has the task's name."""
     found: dict[Any, list[float]] = {}
     pairs: Sequence[tuple[Records, str] | None] = runs.runs or [None] * len(runs.rows)
     of = zip(pairs, runs.rows, _values(runs), strict=True)
@@ -181,7 +181,8 @@ def _normalized(runs: Runs) -> dict[Any, list[float]]:
         else:
             recipe = RecordedRun(*pair).recipe
             task = (recipe.env, getattr(recipe, "hide_velocities", False))
-        found.setdefault(task, []).extend(normalize([value], task[0], read_references()))
+        if tasks is None or task in tasks:
+            found.setdefault(task, []).extend(normalize([value], task[0], read_references()))
     return found
 
 
@@ -357,7 +358,8 @@ def measure(text: str, path: str) -> str:
 
 def _improvement(ours: Runs, others: Runs) -> str:
     """The probability of improvement over the tasks that both have."""
-    a, b = _normalized(ours), _normalized(others)
+    a = _normalized(ours)
+    b = _normalized(others, tasks=a)
     return str(probability_of_improvement({task: a[task] for task in a if task in b}, b))
 
 
