@@ -41,7 +41,8 @@ SUMMARY = (
     "probability of improvement over the first [95%]",
 )
 """The header of :func:`summarize`."""
-_ALTER = ("env_settings", "wrappers", "hide_velocities")  # what its returns can be
+# Fields that change which returns a task allows.
+_ALTER = ("env_settings", "wrappers", "hide_velocities")
 _LEVEL, _POWER = 0.05, 0.8
 _RESAMPLES = 2_000
 _PERMUTATIONS = 10_000
