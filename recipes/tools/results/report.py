@@ -441,7 +441,9 @@ def _share_outside(data: RunData, words: MetricWords, bound: float, sign: int) -
     values = data.values(words.column)
     outside = sign * (values - bound) > 0
     if words.needs in data.rows[0]:  # without changes of that one, it says nothing
-        outside &= np.diff(data.values(words.needs), prepend=np.nan) != 0
+        needed = data.values(words.needs)
+        known = np.maximum.accumulate(np.isfinite(needed) * np.arange(len(needed)))
+        outside &= np.diff(needed[known], prepend=np.nan) != 0
     return float(outside.sum() / max(1, np.isfinite(values).sum()))
 
 

@@ -142,6 +142,7 @@ def test_metrics_that_are_not_healthy_are_pointed_out(tmp_path):
     metrics["kl_approx"][36:] = np.nan  # rows of an evaluation alone
     metrics["explained_variance"][:] = -1
     metrics["return_mean"][5:] = 500  # so it means nothing
+    metrics["return_mean"][6::2] = np.nan  # batches in which no episode ended
     metrics["gradient_norm"][:14] = 6  # less than a quarter of 60
     write_run(tmp_path / "run", TIT, metrics=metrics)
     report(tmp_path / "run", "--out", tmp_path / "a.html", "--no-pictures")
