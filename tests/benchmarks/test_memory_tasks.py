@@ -1,18 +1,16 @@
 """Runs on memory tasks end early where they are solved, and go on where they were stopped."""
 
-from dataclasses import fields, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from benchmarks import memory_tasks, memory_variants
+from benchmarks import memory_tasks
 from benchmarks.measuring import read_rows
 from benchmarks.memory_pictures import main
 from benchmarks.memory_tasks import EPISODES, Successes
-from recipes.core.algorithm import make_algorithm
 from recipes.core.recipe_json import recipe_to_json
 from recipes.core.registry import find_recipe, get_recipe
 from recipes.core.run import Run
@@ -84,36 +82,6 @@ def test_when_nine_in_ten_are_reached(tmp_path):
     successes.batches.append((6, 40, 36))
     assert successes.reached() == 6
     assert EPISODES == 500
-
-
-LARGER = ("frames-32", "tiles-of-28-pixels")
-FIELDS = {
-    "shuffled-windows": {"sequence_length"},
-    "tiles-of-28-pixels": {"backbone", "wrappers"},
-    "own-limit-seven-actions": {"env_settings", "wrappers"},
-}
-
-
-@pytest.mark.parametrize("name", memory_variants.RECIPES)
-def test_a_variant(name):
-    pytest.importorskip("minigrid")
-    recipe = find_recipe(f"{Path(memory_variants.__file__)}:{name}")
-    task, _, word = name.rpartition("/")
-    named = get_recipe(f"{task}/enhanced-tit")
-    changed = {
-        field.name
-        for field in fields(recipe)
-        if getattr(recipe, field.name) != getattr(named, field.name)
-    }
-    assert changed == {"name"} | FIELDS.get(word, {"backbone"})
-    algorithm = make_algorithm(recipe)
-    algorithm.check()
-    history = algorithm.make_env(1, seed=0).reset()["history"]
-    assert history.shape[:2] == (1, recipe.backbone.num_frames)
-    weights = sum(weight.numel() for weight in algorithm.policy.parameters())
-    expected = sum(weight.numel() for weight in make_algorithm(named).policy.parameters())
-    assert 0.75 * expected < weights
-    assert (weights < 1.25 * expected) == (word not in LARGER)
 
 
 SOON, LATER = [(100, 50), (200, 100)], [(100, 50), (200, 100), (400, 0)]
