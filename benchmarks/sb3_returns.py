@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import argparse
 from importlib.metadata import version
+from itertools import accumulate
 from pathlib import Path
 from statistics import fmean
 
 import numpy as np
 import torch
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
@@ -31,38 +31,23 @@ COLUMNS = [
 EVALUATION_SEED, EPISODES = 1_000_000, 100
 
 
-class LastFifth(BaseCallback):
-    """Keeps the returns of the training episodes that end in the last fifth of the steps.
-
-    Args:
-        total_steps: steps of the run.
-    """
-
-    def __init__(self, total_steps: int) -> None:
-        super().__init__()
-        self.begin = 0.8 * total_steps
-        self.returns: list[float] = []
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps > self.begin:
-            infos = self.locals["infos"]
-            self.returns += [info["episode"]["r"] for info in infos if "episode" in info]
-        return True
-
-
 def measure(env: str, seed: int, total_steps: int) -> list[object]:
     """Trains once and evaluates the last weights with their most likely actions; returns a row."""
-    agent = PPO("MlpPolicy", make_vec_env(env, seed=seed), seed=seed, device="cpu")
-    last = LastFifth(total_steps)
-    agent.learn(total_steps, callback=last)
-    returns, _ = evaluate_policy(
+    envs = make_vec_env(env, seed=seed)
+    agent = PPO("MlpPolicy", envs, seed=seed, device="cpu")
+    agent.learn(total_steps)
+    [returns] = envs.env_method("get_episode_rewards")
+    [lengths] = envs.env_method("get_episode_lengths")
+    ends, fifth = accumulate(lengths), 0.8 * total_steps
+    last = [x for x, end in zip(returns, ends, strict=True) if end > fifth]
+    evaluated, _ = evaluate_policy(
         agent,
         make_vec_env(env, seed=EVALUATION_SEED),
         n_eval_episodes=EPISODES,
         return_episode_rewards=True,
     )
-    training = round(fmean(last.returns), 1) if last.returns else ""
-    reached = [round(float(np.mean(returns)), 1), round(float(np.std(returns)), 1), training]
+    training = round(fmean(last), 1) if last else ""
+    reached = [round(float(np.mean(evaluated)), 1), round(float(np.std(evaluated)), 1), training]
     return [env, seed, total_steps, *reached, version("stable-baselines3")]
 
 

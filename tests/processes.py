@@ -8,8 +8,9 @@ own.
 import multiprocessing
 import os
 import random
-from collections.abc import Mapping
-from contextlib import chdir
+import resource
+from collections.abc import Iterator, Mapping
+from contextlib import chdir, contextmanager
 from multiprocessing import forkserver, spawn
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,17 @@ def ensure_running() -> None:
     """The server imports from its current folder, which a test may have changed by then."""
     with chdir(ROOT):
         _ensure_running()
+
+
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """No file grows beyond a number of bytes, as on a disk that is full then."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 # Here rather than in a function, since the server does no more than to import this.

@@ -1,9 +1,9 @@
 import os
-import resource
 from pathlib import Path
 
 import pytest
 
+from tests.processes import files_of_at_most
 from torchrl_tit import files
 
 
@@ -79,13 +79,8 @@ def test_failure_leaves_what_was_there_and_nothing_else(
 def test_a_limit_of_the_operating_system(tmp_path: Path) -> None:
     target = tmp_path / "notes.txt"
     target.write_text("old")
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
-    try:
-        with pytest.raises(OSError, match="File too large"):
-            files.write_bytes_atomic(target, bytes(100_000))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with pytest.raises(OSError, match="File too large"), files_of_at_most(1000):
+        files.write_bytes_atomic(target, bytes(100_000))
     assert target.read_text() == "old"
     assert os.listdir(tmp_path) == ["notes.txt"]
 

@@ -1,10 +1,9 @@
 """Files larger than the memory, and disks that are full."""
 
-import contextlib
 import multiprocessing
 import resource
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.processes import files_of_at_most
 from torchrl_tit.datasets import (
     HistoryStorage,
     SequenceStorage,
@@ -76,17 +76,6 @@ FIELDS = {
     "next_observations": np.roll(NOISE, -1, axis=1),
 }
 EPISODES = episodes_from_arrays(**{name: array[0] for name, array in FIELDS.items()})
-
-
-@contextlib.contextmanager
-def files_of_at_most(size: int) -> Iterator[None]:
-    """No file grows beyond a number of bytes, as on a disk that is full then."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize("size", [0, 100_000])

@@ -99,45 +99,27 @@ def test_what_a_file_says_and_how_many_it_takes(tmp_path):
         assert outputs["action"].shape == (size,)
 
 
-def test_a_file_says_how_many_steps_it_reads(tmp_path):
-    """A Decision Transformer can act on fewer than it learns from."""
-    network = DecisionTransformer((4,), action_dim=2, num_frames=5)
+@pytest.mark.parametrize(
+    ("num_frames", "settings", "read", "step_by_step"),
+    [
+        (5, {}, 2, False),  # it can act on fewer steps than it learns from
+        (4, {"max_ep_len": 7}, 4, True),  # beyond max_ep_len, it has no time step
+        (1, {}, 1, True),  # there are no earlier frames
+    ],
+)
+def test_a_decision_transformer(num_frames, settings, read, step_by_step, tmp_path):
+    network = DecisionTransformer((4,), action_dim=2, num_frames=num_frames, **settings)
     policy = make_dt_actor(network, DTHead(network.features_dim, 2, "discrete")).eval()
 
     def task(copies):
-        transforms = TargetReturn(50.0), SequenceHistory(2)
+        transforms = TargetReturn(50.0), SequenceHistory(read)
         return make_env("CartPole-v1", copies).append_transform(Compose(*transforms))
 
-    said = export_policy(policy, task, tmp_path / "policy.pt2")
-    assert said["inputs"]["observation"]["shape"] == [2, 4]
-    assert said["num_frames"] == 2
-
-
-def test_a_decision_transformer_is_compared_within_its_episodes(tmp_path):
-    """Beyond ``max_ep_len``, it has no time step."""
-    network = DecisionTransformer((4,), action_dim=2, num_frames=4, max_ep_len=7)
-    policy = make_dt_actor(network, DTHead(network.features_dim, 2, "discrete")).eval()
-
-    def task(copies):
-        transforms = TargetReturn(50.0), SequenceHistory(4)
-        return make_env("CartPole-v1", copies).append_transform(Compose(*transforms))
-
-    said = export_policy(policy, task, tmp_path / "policy.pt2", step_by_step=True)
+    said = export_policy(policy, task, tmp_path / "policy.pt2", step_by_step=step_by_step)
     assert said["difference"] < 1e-5
-
-
-def test_a_decision_transformer_of_one_frame_has_no_earlier_ones(tmp_path):
-    policy = make_dt_actor(
-        network := DecisionTransformer((4,), action_dim=2, num_frames=1),
-        DTHead(network.features_dim, 2, "discrete"),
-    ).eval()
-
-    def task(copies):
-        transforms = TargetReturn(50.0), SequenceHistory(1)
-        return make_env("CartPole-v1", copies).append_transform(Compose(*transforms))
-
-    said = export_policy(policy, task, tmp_path / "policy.pt2", step_by_step=True)
-    assert said["difference"] < 1e-5
+    if not step_by_step:  # the file says how many steps it reads
+        assert said["inputs"]["observation"]["shape"] == [read, 4]
+        assert said["num_frames"] == read
 
 
 def test_actions_of_several_dimensions(tmp_path):

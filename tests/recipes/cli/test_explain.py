@@ -17,11 +17,11 @@ from recipes.ppo import PPO
 from recipes.tools.results import explanation, paper_figures
 from tests.recipes.commands import fails
 from tests.recipes.offline.test_without_env import log_machine
-from tests.recipes.small import SMALL_DT, make_discrete_cql, make_dt, train
+from tests.recipes.small import make_cartpole_dt, make_discrete_cql, train
 from tests.recipes.untrained import untrained
 from torchrl_tit.datasets import load_episodes
 from torchrl_tit.evaluation import evaluate
-from torchrl_tit.settings.networks import decision_transformer, enhanced_tit, mlp, nature_cnn
+from torchrl_tit.settings.networks import enhanced_tit, mlp, nature_cnn
 
 TIT: dict[str, Any] = {"patch_size": "auto", "embed_dim": 8, "num_blocks": 1, "features_dim": 8}
 PAGE = (432, 768, 3)
@@ -104,16 +104,6 @@ def test_an_image_task(tmp_path):
         assert pictures[words[-1]].shape == PAGE
     assert (pictures[1] != pictures["value"]).any()
     assert (pictures[1] != pictures["attention"]).any()
-
-
-def make_cartpole_dt(folder):
-    return make_dt(
-        folder,
-        env="CartPole-v1",
-        target_returns=(20.0,),
-        backbone=decision_transformer(**SMALL_DT),
-        action_space="discrete",
-    )
 
 
 def make_pendulum(folder):
@@ -214,26 +204,31 @@ def test_weights_of_all_blocks(pong, cartpole, tmp_path, monkeypatch):
     assert len(panels) == 1, "an array is one patch"
 
 
-def test_a_recorded_episode(tmp_path, capsys, monkeypatch):
+@pytest.fixture
+def explained(monkeypatch):
+    """What is explained, in order."""
+    seen, explain_one = [], explanation.Explainer.explain
+
+    def watch(self, tensordict):
+        seen.append(tensordict.clone())
+        return explain_one(self, tensordict)
+
+    monkeypatch.setattr(explanation.Explainer, "explain", watch)
+    return seen
+
+
+def test_a_recorded_episode(tmp_path, capsys, explained):
     """Each frame of it is explained as where the policy plays, with the actions of the data."""
     pytest.importorskip("captum")
     data, out = log_machine(tmp_path / "log.hdf5"), tmp_path / "step.png"
     recipe = with_spaces(BC(dataset=str(data), backbone=enhanced_tit(3, **TIT), total_updates=1))
     run = train(recipe, tmp_path / "run")
-    seen = []
-
-    class Watching(explanation.Explainer):
-        def explain(self, tensordict):
-            seen.append(tensordict.clone())
-            return super().explain(tensordict)
-
-    monkeypatch.setattr(explanation, "Explainer", Watching)
     explain(run.folder, "--dataset", data, "--episode", 3, "--step", 7, "--out", out)
     line = capsys.readouterr().out.splitlines()[0]
     assert line == f"1 step of episode 3 of {data}"
     assert imageio.imread(out).shape == PAGE
     recorded = load_episodes(data).rows[3 * 21 : 4 * 21]
-    assert seen[0]["history"][0].tolist() == recorded["observation"][5:8].tolist()
+    assert explained[0]["history"][0].tolist() == recorded["observation"][5:8].tolist()
     for words, message in {
         ("--episode", "10"): "has 10 episodes, so there is no episode 10",
         ("--step", "20"): "the episode of the data has 20 steps, so there is no step 20",
@@ -243,22 +238,14 @@ def test_a_recorded_episode(tmp_path, capsys, monkeypatch):
         assert message in fails(capsys, "explain", run.folder, *more)
 
 
-def test_recorded_episodes_are_those_of_the_agents_task(tmp_path, capsys, monkeypatch):
+def test_recorded_episodes_are_those_of_the_agents_task(tmp_path, capsys, explained):
     """As it writes them: categories are counted from 0, and floats are none."""
     pytest.importorskip("captum")
     run = untrained(tmp_path / "run", make_ppo("FrozenLake-v1", enhanced_tit(2, **TIT)))
     states, actions = np.arange(200)[:, None] % 16, np.arange(200) % 4
     data = log_machine(tmp_path / "a.hdf5", observations=states, actions=actions)
-    seen = []
-
-    class Watching(explanation.Explainer):
-        def explain(self, tensordict):
-            seen.append(tensordict["history"][0].flatten().tolist())
-            return super().explain(tensordict)
-
-    monkeypatch.setattr(explanation, "Explainer", Watching)
     explain(run.folder, "--dataset", data, "--step", 7, "--out", tmp_path / "step.png")
-    assert seen == [[6, 7]]
+    assert [one["history"][0].flatten().tolist() for one in explained] == [[6, 7]]
     wrong = {
         "categories: store integers": states / 2,
         "are [16], which Discrete(16) does not have": states + 1,

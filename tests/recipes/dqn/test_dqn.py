@@ -10,10 +10,10 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from recipes.core.algorithm import make_algorithm
 from recipes.core.metrics import read_metrics
 from recipes.dqn import DQN, DQNAlgorithm
 from tests.recipes.small import Batches, train
+from tests.recipes.small import make_algorithm as make
 from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.settings.networks import mlp
 
@@ -31,12 +31,6 @@ SMALL = DQN(
     checkpoint_interval=30,
     evaluation_episodes=1,
 )
-
-
-def make(recipe: DQN) -> DQNAlgorithm:
-    algorithm = make_algorithm(recipe)
-    assert isinstance(algorithm, DQNAlgorithm)
-    return algorithm
 
 
 def double(recipe: DQN, folder: Path) -> tuple[DQNAlgorithm, TensorDict]:

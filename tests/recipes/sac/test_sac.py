@@ -10,10 +10,10 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from recipes.core.algorithm import make_algorithm
 from recipes.core.metrics import read_metrics
 from recipes.sac import SAC, SACAlgorithm
 from tests.recipes.small import Batches, train
+from tests.recipes.small import make_algorithm as make
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
 from torchrl_tit.settings.networks import mlp
 
@@ -31,12 +31,6 @@ SMALL = SAC(
     checkpoint_interval=30,
     evaluation_episodes=1,
 )
-
-
-def make(recipe: SAC) -> SACAlgorithm:
-    algorithm = make_algorithm(recipe)
-    assert isinstance(algorithm, SACAlgorithm)
-    return algorithm
 
 
 def test_parts_of_lost_work_are_replaced_or_ignored(tmp_path: Path) -> None:
