@@ -28,6 +28,9 @@ from torchrl_tit.settings.parts import Names
 # Small networks gain nothing from threads, and parallel test workers would fight over the cores.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+# As the command line sets it, before TorchRL is imported.
+os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+
 processes.use_server()
 
 # A shell that starts the suite in the background ignores Ctrl-C, which tests of it do not expect.

@@ -12,6 +12,8 @@ from torchrl_tit.settings.checks import nearest
 
 from .arguments import fail, import_what_is_typed, one_line_warnings, program, refuse_repeated
 
+os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # of TorchRL, which is imported later
+
 COMMANDS = {
     "list": "named_recipes:list_recipes",
     "show": "named_recipes:show",

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import logging
-from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -252,11 +249,10 @@ class OnlineHistoryStorage(LazyTensorStorage):
         steps["episode"] = starts * self._envs + torch.arange(self._envs, device=self.device)
         if self._is_init:
             steps["is_init"] = (time == starts).unsqueeze(-1)
-        with contextlib.nullcontext() if self.initialized else _without_notice():
-            super().set(
-                torch.arange(begin, stop) % self._num_times,
-                steps if self.ndim == 2 else steps.squeeze(-1),
-            )
+        super().set(
+            torch.arange(begin, stop) % self._num_times,
+            steps if self.ndim == 2 else steps.squeeze(-1),
+        )
         self._count, self._start = stop, starts[-1]
         if len(self._steps.get("episode", ())) < len(self):  # TorchRL shows what is filled
             table = super().get(slice(None)).flatten(0, self.ndim - 1)  # views
@@ -469,18 +465,6 @@ def _check_histories(steps: TensorDictBase) -> None:
                 f"{key!r} is stored, but it is not the newest frame of the histories of these "
                 "steps: let the environment write what History stacks under this key"
             )
-
-
-@contextlib.contextmanager
-def _without_notice() -> Iterator[None]:
-    """Keeps TorchRL from printing that it made a table, in the output of commands."""
-    logger = logging.getLogger("torchrl")
-    level = logger.level
-    logger.setLevel(max(level, logging.WARNING))
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
 
 
 def _table(entries: dict[str, Any], device: torch.device) -> TensorDict:

@@ -298,34 +298,16 @@ class Backbone(ActingModule):
                 outputs = self.module(*(windows.gather(table) for table in frames))
         return self._in_full(outputs)
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Keys of all entries that it reads; fixed, because other attributes follow from them."""
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, keys: Sequence[NestedKey]) -> None:
-        self._in_keys = self._fixed("in_keys", keys)
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """Keys of all entries that it writes, or those of ``select_out_keys``; fixed, too."""
-        return self._out_keys_apparent
-
-    @out_keys.setter
-    def out_keys(self, keys: Sequence[NestedKey]) -> None:
-        self._out_keys = self._out_keys_apparent = self._fixed("out_keys", keys)
-
-    def _fixed(self, name: str, keys: Sequence[NestedKey]) -> list[NestedKey]:
-        """Returns keys; raises AttributeError if they would replace others."""
-        given: list[NestedKey] = unravel_key_list(list(keys))
-        present = self.__dict__.get(f"_{name}", given)
-        if given != present:
-            raise AttributeError(
-                f"{name} of a backbone cannot be changed from {present} to {given}: build another "
-                "one of the same network, Backbone(backbone.module, in_keys, out_keys)"
-            )
-        return given
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Refuses other keys, because other attributes follow from them."""
+        if name in ("in_keys", "out_keys") and f"_{name}" in vars(self):
+            present, given = vars(self)[f"_{name}"], unravel_key_list(list(value))
+            if given != present:
+                raise AttributeError(
+                    f"{name} of a backbone cannot be changed from {present} to {given}: build "
+                    "another one of the same network, Backbone(backbone.module, in_keys, out_keys)"
+                )
+        super().__setattr__(name, value)
 
     @property
     def features_dim(self) -> int:
