@@ -150,6 +150,9 @@ class DQNAlgorithm(ReplayAlgorithm[DQN]):
 
     def loss(self, samples: TensorDictBase) -> Terms:
         """Returns the terms of the loss; see :meth:`ReplayAlgorithm.loss`."""
+        if self.recipe.mask_actions:  # a truncated state is valued, also if it allows nothing
+            allowed = samples["next", MASK]
+            allowed |= ~allowed.any(-1, keepdim=True)
         return {"loss_value": self.model(samples)["loss"]}
 
     def learn(self, samples: TensorDictBase, number: int) -> Terms:

@@ -334,7 +334,7 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
                 for name in sums:
                     sums[name] += means[name].item() * count
         values = {name: value / total for name, value in sums.items()}
-        return HeldOut(step, len(episodes.lengths), values)
+        return HeldOut(step, items.num_episodes, values)
 
     @abstractmethod
     def make_buffer(self) -> Buffer:

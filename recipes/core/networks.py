@@ -24,7 +24,8 @@ from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, QValueMo
 
 from torchrl_tit.envs import observation_specs
 from torchrl_tit.frames import NormalizedFrames, share_statistics
-from torchrl_tit.frames.observation import Observations, read_observations
+from torchrl_tit.frames.observation import Observation, Observations, read_observations
+from torchrl_tit.layers.images import bytes_to_floats
 from torchrl_tit.modules import Backbone, as_sequences, history_keys, make_actor
 from torchrl_tit.modules.action_specs import describe, has_bounds
 from torchrl_tit.modules.backbone import trunks_of
@@ -210,11 +211,14 @@ def make_critic(
         backbone = make_backbone(network, observation, out_key=key, **shared)
         modules, size = [backbone], backbone.features_dim
     else:
-        key, size = "observation", _array_size(observation)
+        key, array = "observation", _only_array(observation)
+        size = array.entries
         if normalization is not None:
             frames = NormalizedFrames(Flat().build((size,)), **normalization)
             flat = nn.Sequential(frames, nn.Flatten(-2))
             modules, key = [TensorModule(flat, [key], ["normalized"])], "normalized"
+        elif array.dtype == torch.uint8:  # as frame encoders read bytes
+            modules, key = [TensorModule(bytes_to_floats, [key], ["floats"])], "floats"
     mlp = MLP(
         size + action_dim,
         values,
@@ -281,8 +285,8 @@ def _bounded(backbone: Backbone, action_spec: Bounded, key: str) -> list[nn.Modu
     ]
 
 
-def _array_size(observation: Observations) -> int:
-    """Returns the number of entries of the only observation, which must be an array."""
+def _only_array(observation: Observations) -> Observation:
+    """Returns the only observation, which must be an array."""
     read = read_observations(observation)
     first = next(iter(read.values()))
     if len(read) > 1:
@@ -293,7 +297,7 @@ def _array_size(observation: Observations) -> int:
     if first.kind != "array":
         kind = "images" if first.kind == "image" else first.kind
         raise ValueError(f"an MLP cannot value {kind} {first.shape}: set critic to 'backbone'")
-    return first.entries
+    return first
 
 
 def name_chosen_encoders(algorithm: Algorithm[Any]) -> tuple[Recipe, str]:

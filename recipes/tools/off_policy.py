@@ -89,7 +89,7 @@ def evaluate_on_data(
             )
         evaluation["ope"] = ope
         known = recorded_log_probs(dataset, episodes) if ope == "wis" else None
-        if episodes.cut.any():
+        if not episodes.is_whole.all():
             episodes, known = without_parts(episodes, known)
         if ope == "fqe":
             evaluation |= fitted_q(algorithm, episodes, UPDATES[ope])
@@ -152,7 +152,8 @@ def weighted_returns(
 
     It is per decision and consistent: a reward has the weight of its episode's actions so far,
     divided by the sum of these weights over all episodes; an episode keeps its last one. The policy
-    takes its most likely actions, so an episode has no weight after another action.
+    takes its most likely actions, so an episode has no weight after another action. Resamples of
+    the bootstrap in which no episode has one do not count.
 
     Args:
         algorithm: has the policy.
@@ -202,8 +203,8 @@ def weighted_returns(
         )
     paid = weights * rewards_by_episode(episodes) * gamma ** torch.arange(weights.shape[1])
 
-    def value(counts: Tensor) -> Tensor:  # [B, E]; rewards that no drawn episode reaches are 0
-        return ((counts @ paid) / (counts @ weights)).nan_to_num(0.0).sum(1)
+    def value(counts: Tensor) -> Tensor:  # [B, E]; NaN where no drawn episode has a weight
+        return ((counts @ paid) / (counts @ weights)).sum(1)
 
     drawn = _resamples(len(lengths), recipe.evaluation_seed)
     counts = torch.stack([row.bincount(minlength=len(lengths)) for row in drawn]).double()
@@ -235,7 +236,7 @@ def recorded_log_probs(dataset: str, episodes: Episodes) -> Tensor | None:
 
 
 def without_parts(episodes: Episodes, log_probs: Tensor | None) -> tuple[Episodes, Tensor | None]:
-    """Selects the whole episodes: parts begin or end at a gap, where no episode does.
+    """Selects the whole episodes: of parts and unfinished ones, the return is not known.
 
     Args:
         episodes: the data.
@@ -322,8 +323,8 @@ def _resamples(count: int, seed: int) -> Tensor:
 
 
 def _entries(value: Tensor, means: Tensor, episodes: Episodes, gamma: float) -> dict[str, Any]:
-    """The entries of an estimate; means are those of the bootstrap's resamples, [B]."""
-    low, high = means.quantile(means.new_tensor([0.025, 0.975])).tolist()
+    """The entries of an estimate; means are those of the bootstrap's resamples, [B], or NaN."""
+    low, high = means.nanquantile(means.new_tensor([0.025, 0.975])).tolist()
     return {
         "gamma": gamma,
         "value": value.item(),

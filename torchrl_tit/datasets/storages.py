@@ -74,6 +74,8 @@ class EpisodeStorage(TensorStorage):
         shifts = episodes.first_rows - (counts.cumsum(0) - counts)
         rows = torch.arange(count, device=device) + shifts.repeat_interleave(counts)
         super().__init__(rows, device=device)
+        self.num_episodes = int(counts.count_nonzero())
+        """Number of episodes that have items."""
         self._fields = dict(episodes.rows.items())  # [R, ...]
         self._first_rows = episodes.first_rows
 

@@ -108,6 +108,20 @@ def test_the_target_of_a_gradient_step(doubled: bool, tmp_path: Path) -> None:
     assert terms["epsilon"] == 1
 
 
+def test_all_actions_count_where_a_truncated_state_allows_none(tmp_path: Path) -> None:
+    recipe = replace(SMALL, env="Taxi-v4", mask_actions=True)
+    algorithm = make(recipe)
+    algorithm.prepare(0, tmp_path)
+    batch = next(iter(algorithm.batches())).flatten()
+    algorithm.close()
+    allowed = batch.clone()
+    allowed["next", "action_mask"][:] = True
+    batch["next", "action_mask"][::2] = False
+    allowed["next", "action_mask"][1::2] = batch["next", "action_mask"][1::2]
+    found, expected = (algorithm.loss(one)["loss_value"] for one in (batch, allowed))
+    torch.testing.assert_close(found, expected)
+
+
 def test_target_updates_and_learning(tmp_path: Path) -> None:
     recipe = replace(SMALL, learning_rate=0.05, target_interval=30)
     algorithm, batch = double(recipe, tmp_path)

@@ -171,6 +171,42 @@ def test_weights_are_those_of_the_formula(tmp_path):
         weighted_returns(algorithm, replace(episodes, rows=rows), known, 0)
 
 
+def test_resamples_in_which_no_episode_has_a_weight_do_not_count(tmp_path, monkeypatch):
+    """All episodes return the same, and two of twenty take the policy's actions to their end."""
+    actions = np.zeros((20, 10), int)
+    actions[2:, 5] = 1
+    arrays: dict[str, Any] = {"actions": actions.ravel(), "rewards": np.full(200, -1.0)}
+    data = log_machine(tmp_path / "log.hdf5", length=10, **arrays)
+    algorithm = make_algorithm(make(DiscreteCQL, tmp_path, env="", dataset=str(data), gamma=0.5))
+    monkeypatch.setattr(off_policy, "_act", lambda _, states: torch.zeros(len(states)).long())
+    episodes = read_data(algorithm.recipe)
+    found = weighted_returns(algorithm, episodes, torch.full([200], -0.7).double(), 0)
+    for name in ("value", "low", "high", "data_value"):
+        assert found[name] == pytest.approx(-2 * (1 - 0.5**10))
+
+
+def what_is_given_to(ope: str, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Keeps what an estimate is made of."""
+    found: list[Any] = []
+
+    def keep(_: Any, *given: Any) -> dict[str, float]:
+        found.extend(given)
+        return {}
+
+    name = {"fqe": "fitted_q", "wis": "weighted_returns"}[ope]
+    monkeypatch.setattr(off_policy, name, keep)
+    return found
+
+
+@pytest.mark.parametrize("ope", ["fqe", "wis"])
+def test_an_unfinished_episode_has_no_return(tmp_path, monkeypatch, ope):
+    data = log_machine(tmp_path / "log.hdf5", 205, actions=np.arange(205) % 3)
+    recipe = with_spaces(BC(dataset=str(data), backbone=SMALL, total_updates=1, name="bc/mine"))
+    run, found = train(recipe, tmp_path / "run"), what_is_given_to(ope, monkeypatch)
+    evaluate_on_data(run, recipe, str(data), ope=ope)
+    assert found[0].lengths.tolist() == [20] * 10
+
+
 @pytest.mark.parametrize("ope", ["fqe", "wis"])
 def test_parts_of_episodes_that_a_gap_cut_are_left_out(tmp_path, monkeypatch, ope):
     draw = np.random.default_rng(0)
@@ -185,15 +221,7 @@ def test_parts_of_episodes_that_a_gap_cut_are_left_out(tmp_path, monkeypatch, op
     recipe = with_spaces(
         BC(dataset=str(data), backbone=SMALL, total_updates=1, gaps="cut", name="bc/mine")
     )
-    run = train(recipe, tmp_path / "run")
-    found: list[Any] = []
-
-    def keep(_: Any, *given: Any) -> dict[str, float]:
-        found.extend(given)
-        return {}
-
-    name = {"fqe": "fitted_q", "wis": "weighted_returns"}[ope]
-    monkeypatch.setattr(off_policy, name, keep)
+    run, found = train(recipe, tmp_path / "run"), what_is_given_to(ope, monkeypatch)
     evaluate_on_data(run, recipe, str(data), ope=ope)
     assert found[0].lengths.tolist() == [20] * 9
     if ope == "wis":

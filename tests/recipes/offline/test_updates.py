@@ -20,6 +20,7 @@ from recipes.dqn import DQN
 from recipes.offline import read_data
 from recipes.sac import SAC
 from tests.datasets.rollouts import roll, write
+from tests.recipes.offline.test_without_env import log_machine
 from tests.recipes.small import (
     BC,
     IQL,
@@ -398,3 +399,21 @@ def test_data_of_one_of_several_observations(tmp_path, monkeypatch, key, shape):
     batch = next(algorithm.batches())
     assert batch["history"].shape[2:] == shape
     algorithm.update(batch, 0)
+
+
+@pytest.mark.parametrize("kind", [IQL, TD3BC, CQL])
+def test_critics_read_bytes_as_the_policy_does(tmp_path, kind):
+    draw = np.random.default_rng(0)
+    data = log_machine(
+        tmp_path / "log.hdf5", observations=draw.integers(0, 256, (200, 5), np.uint8)
+    )
+    recipe = make(kind, tmp_path, env="", dataset=str(data), normalize_observations=False)
+    algorithm = make_algorithm(recipe)
+    algorithm.prepare(0, tmp_path)
+    batch = algorithm.buffer.sample()
+    terms = algorithm.update(batch, 0)
+    assert all(torch.as_tensor(value).isfinite().all() for value in terms.values())
+    critic, floats = algorithm.make_critic(algorithm.make_env(1), 2), batch.clone()
+    floats["observation"] = batch["observation"] / 255
+    values = critic(batch)["state_action_value"]
+    assert torch.equal(values, critic(floats)["state_action_value"])

@@ -137,6 +137,13 @@ def test_the_measures_of_held_out_episodes(tmp_path):
     assert torch.equal(torch.get_rng_state(), state)
 
 
+@pytest.mark.parametrize(("unfinished", "count"), [("drop", 10), ("keep", 11)])
+def test_episodes_that_are_not_measured_are_not_counted(unfinished, count, tmp_path):
+    data = str(log_machine(tmp_path / "log.hdf5", 205))
+    recipe = BC(dataset=data, backbone=SMALL, unfinished=unfinished)
+    assert make_algorithm(recipe).measure(0, read_data(recipe)).episodes == count
+
+
 def test_no_more_items_are_measured_than_the_limit(tmp_path, monkeypatch):
     data = str(log_machine(tmp_path / "log.hdf5"))
     recipe = BC(dataset=data, backbone=SMALL, validation_fraction=0.9)
