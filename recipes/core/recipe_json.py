@@ -100,7 +100,7 @@ def _convert_part(kind: type[Part], value: Any, name: str) -> Part:
         part = kind.get(fields.pop(_ENCODER, None))
     except ValueError as error:
         raise ValueError(f"field {name + '.' + _ENCODER!r}: {error}") from error
-    return _convert(part, fields, f"{name}.")
+    return _convert(part, part.from_older(fields), f"{name}.")
 
 
 def _convert_parts(kind: Any, value: Any, name: str) -> dict[str, Part]:

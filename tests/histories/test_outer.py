@@ -96,3 +96,13 @@ def test_temporal_positions(kind: str, positions: TemporalPositions) -> None:
     uniform = torch.ones(FRAMES, FRAMES).tril() / torch.arange(1, FRAMES + 1).unsqueeze(-1)
     assert torch.allclose(weights, uniform.expand_as(weights)) == (positions == "none")
     assert encoder(tokens).shape == (6, encoder.out_features)
+
+
+def test_fields_of_an_older_version_are_read() -> None:
+    for old, new in ((True, "learned"), (False, "none")):
+        fields = {"temporal_position_encoding": old, "num_heads": 2}
+        assert settings.PairedOuter(**settings.PairedOuter.from_older(fields)) == (
+            settings.PairedOuter(num_heads=2, temporal_positions=new)  # type: ignore[arg-type]
+        )
+    with pytest.raises(ValueError, match="temporal_position_encoding is true or false, not 1"):
+        settings.Outer.from_older({"temporal_position_encoding": 1})

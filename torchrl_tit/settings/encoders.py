@@ -200,6 +200,16 @@ class OuterSettings(TransformerSettings, HistorySettings):
                 "num_frames is 1: raise it, or set temporal_positions to none"
             )
 
+    @classmethod
+    def from_older(cls, fields: dict[str, Any]) -> dict[str, Any]:
+        """Converts the boolean field of older versions, which had learned positions only."""
+        learned = fields.pop("temporal_position_encoding", None)
+        if isinstance(learned, bool):
+            fields["temporal_positions"] = "learned" if learned else "none"
+        elif learned is not None:
+            raise ValueError(f"temporal_position_encoding is true or false, not {learned!r}")
+        return fields
+
 
 @dataclass(frozen=True, kw_only=True)
 class SlidingOuterSettings(OuterSettings):

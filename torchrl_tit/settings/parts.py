@@ -124,6 +124,15 @@ class Part:
         """
         return cls.registered.find(name)
 
+    @classmethod
+    def from_older(cls, fields: dict[str, Any]) -> dict[str, Any]:
+        """Renames fields in JSON from older versions of the part; by default, renames none.
+
+        Args:
+            fields: the fields by name, which may be changed in place.
+        """
+        return fields
+
     def build(self, *args: Any, **kwargs: Any) -> Any:
         """Imports the implementation and builds it: ``Class(settings, *args, **kwargs)``."""
         return resolve(self.builds)(self, *args, **kwargs)
