@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import copy
+import pickle
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +99,36 @@ def test_items_are_those_of_the_environment(seed: int, tmp_path: Path) -> None:
         each.extend(more)
     assert (again.storage.get(slice(None)) == buffer.storage.get(slice(None))).all()
     assert (restored.storage.get(slice(None)) == buffer.storage.get(slice(None))).all()
+
+
+@pytest.mark.parametrize("envs", [None, 3])
+@pytest.mark.parametrize("make_copy", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_a_copy_goes_on_by_itself(envs: int | None, make_copy: Callable[[Any], Any]) -> None:
+    steps = play_several(envs, STEPS, 4, "same")
+    buffer = make(envs, 20 * (envs or 1), 4)
+    buffer.extend(without_histories(steps[..., :30]))
+    other = make_copy(buffer)
+    for time, each in ((STEPS, other), (30, buffer)):
+        if time > 30:
+            each.extend(without_histories(steps[..., 30:]))
+        assert_items(each.storage.get(slice(None)), newest(steps, time, 20 * (envs or 1)))
+
+
+def test_batches_of_several_workers_are_not_one_sequence() -> None:
+    """Those that come one after the other; without "is_init", the environment may be reset."""
+    workers = without_histories(play_several(3, 12, 2, "same"))
+    workers["is_init"] = torch.zeros(3, 12, 1, dtype=torch.bool)
+    workers["is_init"][:, 1:] = workers["next", "done"][:, :-1]
+    workers["is_init"][:, 4] = True  # reset without a flag
+    make(3, 36, 2).extend(workers)
+    buffer = make(None, 30, 2)
+    buffer.extend(workers[0, :6])
+    with pytest.raises(ValueError, match=r"batches of several workers .* ndim=2"):
+        buffer.extend(workers[1, 6:])
+    assert len(buffer) == 6
+    buffer = make(None, 30, 2)
+    for worker in workers:
+        buffer.extend(worker.exclude("is_init"))
 
 
 def test_is_init_and_episode() -> None:
@@ -222,13 +254,13 @@ def test_an_episode_that_a_resume_cut_off_stays_cut_off(envs: int | None, tmp_pa
         whole = buffer.storage.get(slice(None))
         items.append(whole.reshape(8, -1).transpose(0, 1))
     assert (items[0] == items[1]).all()
-    for copy in items[0]:
-        assert copy["is_init"].flatten().nonzero().flatten().tolist() == [0, 5]
-        assert copy["episode"][4] != copy["episode"][5]
+    for one in items[0]:
+        assert one["is_init"].flatten().nonzero().flatten().tolist() == [0, 5]
+        assert one["episode"][4] != one["episode"][5]
         # The last step before the cut bootstraps from its own next history.
-        assert copy["next", "history"][4].flatten().tolist() == [1, 1, 1]
-        assert copy["history"][5].flatten().tolist() == [0, 0, 1]
-        assert not copy["next", "terminated"].any()
+        assert one["next", "history"][4].flatten().tolist() == [1, 1, 1]
+        assert one["history"][5].flatten().tolist() == [0, 0, 1]
+        assert not one["next", "terminated"].any()
 
 
 def test_what_is_refused() -> None:

@@ -171,6 +171,13 @@ def test_bytes_and_floats_of_flat_frames_stand_side_by_side():
     assert_near(network(pixels, state), network(pixels / 255, state))
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_features_under_autocast_have_the_dtype_of_the_weights(dtype):
+    backbone = Backbone(EnhancedTIT((4,), num_frames=3), autocast=torch.bfloat16).to(dtype)
+    td = TensorDict({"history": torch.randn(2, 3, 4, dtype=dtype)}, [2])
+    assert backbone(td)["features"].dtype == dtype
+
+
 @pytest.mark.parametrize("acts", [False, True])
 def test_autocast_computes_in_bfloat16_and_writes_float32(acts):
     torch.manual_seed(0)

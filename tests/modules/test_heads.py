@@ -7,6 +7,8 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
+from torch import nn
+from torch.distributions import kl_divergence
 from torch.nn import functional as F
 from torch.nn.functional import one_hot
 from torchrl.data import (
@@ -181,6 +183,28 @@ def test_a_batched_spec_that_does_not_tell_is_refused(spec):
     with pytest.raises(ValueError, match=r"shape=\[8, 2\].*: pass env.action_spec_unbatched"):
         make_actor(16, spec)
     assert act(make_actor(16, spec, batch_dims=1), features(8))["action"].shape == (8, 2)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("spec", [MultiCategorical([2, 3]), MultiOneHot([2, 3])])
+def test_the_divergence_of_choices_and_its_gradient(spec, masked):
+    """By enumeration, in float64; one component has fewer options than the other."""
+    actor = make_actor(4, spec, mask_key="mask" if masked else None).double()
+    for weight in actor.parameters():
+        nn.init.normal_(weight)
+    features = torch.randn(2, 6, 4, dtype=torch.float64)
+    mask = torch.ones(6, 5, dtype=torch.bool)
+    mask[:3, 4] = False
+    p, q = (actor.get_dist(TensorDict({"features": x, "mask": mask}, [6])) for x in features)
+    divergence = kl_divergence(p, q)
+    every = [spec.rand() for _ in range(200)]
+    actions = torch.stack(list({str(x.tolist()): x for x in every}.values())).unsqueeze(1)
+    actions = actions.expand(-1, 6, *actions.shape[2:])
+    logs, others = p.log_prob(actions), q.log_prob(actions)
+    terms = torch.where(logs.isinf(), 0.0, logs.exp() * (logs - others))
+    torch.testing.assert_close(divergence, terms.nan_to_num(0.0).sum(0))
+    divergence.mean().backward()
+    assert all(weight.grad.isfinite().all() for weight in actor.parameters())
 
 
 def test_a_row_without_any_action_is_refused():

@@ -70,6 +70,30 @@ def test_sequences_equal_single_steps(trunks, name):
 
 
 @pytest.mark.usefixtures("float64")
+@pytest.mark.parametrize("name", ["mingru", "gated-deltanet", "mamba2"])
+@torch.no_grad()
+def test_stored_states_count_under_vmap(name):
+    """TorchRL maps over the weights of critics, and GAE over the data; LSTMs cannot be mapped."""
+    backbone = make_backbone(name=name)
+    td = sequences(backbone)
+    for state in map(td.get, backbone.state_shapes):
+        state.normal_()
+    td["is_init"][:, 0] = True  # as a SliceSampler marks the first steps of slices
+    with set_recurrent_mode(True):
+        expected = backbone(td.clone())["features"]
+        weights = TensorDict.from_module(backbone)
+
+        def with_weights(weights, td):
+            with weights.to_module(backbone):
+                return backbone(td.copy())["features"]
+
+        both = torch.vmap(with_weights, (0, None))(torch.stack([weights, 2 * weights]), td)
+        twice = torch.vmap(backbone)(torch.stack([td, td]))["features"]
+    assert_near(both[0], expected)
+    assert_near(twice, expected.expand_as(twice))
+
+
+@pytest.mark.usefixtures("float64")
 @pytest.mark.parametrize("name", ["lstm", "gru", "mingru", "gated-deltanet", "mamba2"])
 @torch.no_grad()
 def test_the_next_values_of_gae_are_those_of_the_steps_that_follow(name):

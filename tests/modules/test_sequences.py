@@ -76,6 +76,14 @@ def test_every_pair_equals_single_steps(pair: Pair, padding: Padding) -> None:
             )
 
 
+def test_vmap_over_stored_histories_is_refused() -> None:
+    """How many of them count depends on the data."""
+    td = sequences(CASE, "same")
+    backbone = backbone_of(network_of(CASE))
+    with set_recurrent_mode(True), pytest.raises(ValueError, match="use deactivate_vmap=True"):
+        torch.vmap(backbone)(torch.stack([td, td]))
+
+
 @pytest.mark.parametrize("padding", [None, *PADDINGS])
 def test_without_histories_the_valid_steps_are_those_of_single_steps(
     padding: Padding | None,

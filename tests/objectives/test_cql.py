@@ -263,6 +263,17 @@ def test_forward_computes_the_same_terms_and_adds_priorities_to_the_batch(monkey
         torch.testing.assert_close(terms[name], value.detach(), msg=name)
 
 
+def test_the_action_has_the_key_of_the_actor():
+    actor = make_squashed_actor(
+        OBSERVATION, SPEC, in_key="observation", action_key=("arm", "action")
+    )
+    critic = ValueOperator(Quadratic(), in_keys=["state", ("arm", "action")])
+    loss = ContinuousCQLLoss(actor, critic, action_spec=SPEC)
+    assert ("arm", "action") in loss.in_keys
+    with pytest.raises(KeyError, match="arm"):
+        loss(make_batch())
+
+
 @pytest.mark.parametrize("spec", [Categorical(3), Unbounded((2,)), Bounded(-1, 1, shape=(4, 2))])
 def test_actions_without_bounds_are_refused(spec):
     actor = make_squashed_actor(OBSERVATION, SPEC, in_key="observation")

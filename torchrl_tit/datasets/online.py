@@ -174,7 +174,8 @@ class OnlineHistoryStorage(LazyTensorStorage):
         Raises:
             RuntimeError: if items are to be changed, or written out of order.
             ValueError: if the steps do not cover all environments, have histories of another entry
-                than "observation", or were made n-step ones by TorchRL's `MultiStepTransform`.
+                than "observation", do not continue those before them though "is_init" is False, or
+                were made n-step ones by TorchRL's `MultiStepTransform`.
         """
         if not set_cursor:
             raise RuntimeError("Stored steps cannot be changed, only added.")
@@ -217,13 +218,22 @@ class OnlineHistoryStorage(LazyTensorStorage):
         begin, count = self._count, len(steps)
         frames, following = (group.select("observation") for group in (steps, steps["next"]))
         done = steps["next", "done"].reshape(steps.shape)
-        goes_on = torch.zeros_like(done)  # whether a step continues the episode of the one before
-        goes_on[1:] = ~done[:-1] & same_observations(following[:-1], frames[1:])
+        ended = torch.ones_like(done)  # whether it is known that the step before ended its episode
+        goes_on = torch.zeros_like(done)  # whether a step continues that episode
+        ended[1:], goes_on[1:] = done[:-1], same_observations(following[:-1], frames[1:])
         if begin:
             last, newest = self._newest()
-            goes_on[0] = (self._ends[last] < 0) & same_observations(newest, frames[0])
+            ended[0], goes_on[0] = self._ends[last] >= 0, same_observations(newest, frames[0])
         if "is_init" in steps.keys():  # noqa: SIM118 (a tensordict)
-            goes_on &= ~steps["is_init"].reshape(steps.shape)
+            is_init = steps["is_init"].reshape(steps.shape)
+            if not (ended | goes_on | is_init).all():
+                raise ValueError(
+                    'These steps do not continue those before them, though "is_init" is False, as '
+                    "where batches of several workers follow one another: give each worker a "
+                    "storage of its own, or stack them with ndim=2."
+                )
+            ended |= is_init
+        goes_on &= ~ended
         if begin:  # only the new steps show whether these ended an episode
             self._end(last, newest, ~goes_on[0])
         time = torch.arange(begin, begin + count, device=self.device).unsqueeze(-1)
@@ -255,8 +265,18 @@ class OnlineHistoryStorage(LazyTensorStorage):
         )
         self._count, self._start = stop, starts[-1]
         if len(self._steps.get("episode", ())) < len(self):  # TorchRL shows what is filled
-            table = super().get(slice(None)).flatten(0, self.ndim - 1)  # views
-            self._steps = dict(table.items(True, True))
+            self._show_steps()
+
+    def _show_steps(self) -> None:
+        """Looks up TorchRL's table, whose entries are views of it."""
+        table = super().get(slice(None)).flatten(0, self.ndim - 1)
+        self._steps = dict(table.items(True, True))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restores a copy, whose views are those of its own table."""
+        super().__setstate__(state)
+        if self._count:
+            self._show_steps()
 
     def _newest(self) -> tuple[Tensor, TensorDict]:
         """The rows of the newest steps, int64 [envs], and the frames after them."""

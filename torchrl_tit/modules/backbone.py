@@ -99,8 +99,9 @@ class Backbone(ActingModule):
 
     Shuffled single steps are not sequences: leave out their ``is_init``, or call the backbone
     within ``set_recurrent_mode(False)``. `SliceSampler` sets ``is_init`` at the beginning of each
-    slice, which is right with histories; without them, pass ``init_key=None`` to it. Dropout in the
-    frame encoder is drawn once per frame.
+    slice, which is right with histories; without them, pass ``init_key=None`` to it. Compiled, a
+    network that carries a state starts from zeros at each ``is_init``, whatever state is stored.
+    Dropout in the frame encoder is drawn once per frame.
 
     Args:
         network: a :class:`~torchrl_tit.networks.HistoryNetwork`, which maps histories to features
@@ -357,9 +358,11 @@ class Backbone(ActingModule):
         return torch.autocast(device.type, self.autocast)
 
     def _in_full(self, outputs: Tensor | Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Returns the outputs in the full precision that heads and losses need."""
+        """Returns the outputs in the precision of the weights, which heads and losses need."""
         outputs = (outputs,) if isinstance(outputs, Tensor) else tuple(outputs)
-        return outputs if self.autocast is None else tuple(x.float() for x in outputs)
+        if self.autocast is None:
+            return outputs
+        return tuple(x.to(weights_dtype(self.module)) for x in outputs)
 
     def _encode(self, tensors: Sequence[Tensor]) -> Any:
         if self.every_frame:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Size, Tensor, distributions
+from torch.distributions.kl import register_kl
 from torch.nn.functional import one_hot
 from torchrl.modules import MaskedCategorical
 
@@ -76,6 +77,15 @@ class IndependentCategorical(distributions.Independent):
 
     def _decode(self, value: Tensor) -> Tensor:
         return value.long()
+
+
+@register_kl(IndependentCategorical, IndependentCategorical)
+def _kl(p: IndependentCategorical, q: IndependentCategorical) -> Tensor:
+    """The divergence; PyTorch's subtracts infinite logits of missing options: NaN in gradients."""
+    first, second = p.base_dist, q.base_dist
+    missing = first.probs == 0
+    ratio = first.logits.masked_fill(missing, 0) - second.logits.masked_fill(missing, 0)
+    return (first.probs * ratio).flatten(len(p.batch_shape)).sum(-1)
 
 
 class IndependentOneHotCategorical(IndependentCategorical):

@@ -21,7 +21,7 @@ from torchrl_tit.modules.frame_tables import (
     table_of_stored,
     table_without_histories,
 )
-from torchrl_tit.modules.torch_internals import is_transformed
+from torchrl_tit.modules.torch_internals import is_mapped, is_transformed
 from torchrl_tit.networks import HistoryNetwork
 from torchrl_tit.settings.choices import Padding
 from torchrl_tit.windows import differs
@@ -124,6 +124,11 @@ class SequenceKeys:
             _check_padding(table, [flat(x) for x in histories])
             return table
         if histories:
+            if is_mapped(starts):
+                raise ValueError(
+                    "vmap cannot map over sequences whose histories all count: use "
+                    "deactivate_vmap=True, or a backbone with padding"
+                )
             return table_of_stored([flat(x) for x in histories], observations, starts)
         padding, num_frames = self.padding or "same", trunks[0].num_frames
         return table_without_histories(observations, is_init, starts, num_frames, padding)
@@ -167,7 +172,8 @@ def step_episodes(
     As an `LSTMModule` does, a sequence starts from the stored state wherever ``is_init`` is True.
     It is not always zero: a `SliceSampler` marks where slices begin, and `GAE` marks next steps
     like the steps before them. A network starts an episode from zeros, so it is told here that none
-    begins. While PyTorch records or transforms the computation, every stored state counts as zero.
+    begins. Within ``torch.compile``, every stored state counts as zero. Where ``vmap`` maps over
+    the data, each step is read on its own, which is slow.
 
     Args:
         step: :meth:`HistoryNetwork.step`.
@@ -180,8 +186,9 @@ def step_episodes(
         the last one of a sequence is right.
     """
     begins = is_init.squeeze(-1)
-    values_count = recurrent_mode() and not (is_transformed() or begins.is_meta)
-    if not (values_count and any(x[begins].any() for x in state.values())):
+    mapped = any(map(is_mapped, [begins, *state.values()]))
+    values_count = recurrent_mode() and not (torch.compiler.is_compiling() or begins.is_meta)
+    if not (values_count and (mapped or any(x[begins].any() for x in state.values()))):
         return step(histories, state, is_init)
     time, outputs = begins.ndim - 1, []
 
@@ -191,9 +198,11 @@ def step_episodes(
             for key, x in state.items()
         }
 
-    cuts = {0, *begins.reshape(-1, begins.shape[-1]).any(0).nonzero().flatten().tolist()}
+    length = begins.shape[-1]
+    marked = () if mapped else begins.reshape(-1, length).any(0).nonzero().flatten().tolist()
+    cuts = range(length) if mapped else sorted({0, *marked})
     now = {key: x.select(time, 0) for key, x in state.items()}
-    for first, end in pairwise([*sorted(cuts), begins.shape[-1]]):
+    for first, end in pairwise([*cuts, length]):
         stored = {key: x.select(time, first) for key, x in state.items()}
         begin = begins.select(time, first)
         now = {
@@ -204,7 +213,7 @@ def step_episodes(
         output, after = step(part, repeat(now, end - first), none)
         outputs.append(output)
         now = {key: x.select(time, -1) for key, x in after.items()}
-    return torch.cat(outputs, time), repeat(now, begins.shape[-1])
+    return torch.cat(outputs, time), repeat(now, length)
 
 
 def as_sequences(samples: TensorDictBase, burn_in: int = 0) -> TensorDictBase:
@@ -300,7 +309,7 @@ def _check_consecutive(observation: Tensor, following: Tensor, starts: Tensor) -
             "in recurrent mode the last batch dimension is time, but the next observation of a "
             "step is not the observation of the step after it: leave is_init out of shuffled steps "
             "and those of MultiStep (or read them within set_recurrent_mode(False)), and set it "
-            "where a sequence begins"
+            'where a sequence begins; the mask of padded steps is ("collector", "mask")'
         )
 
 

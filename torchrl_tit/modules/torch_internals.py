@@ -36,6 +36,20 @@ def is_transformed() -> bool:
     return torch.compiler.is_compiling() or torch._C._functorch.peek_interpreter_stack() is not None
 
 
+def is_mapped(tensor: Tensor) -> bool:
+    """Returns whether ``vmap`` or another transform of ``torch.func`` maps over a tensor.
+
+    One over weights alone, such as TorchRL's over several critics, leaves the data as they are.
+
+    Example:
+        >>> data = torch.ones(2)
+        >>> _ = torch.vmap(lambda x: print(is_mapped(x), is_mapped(data)) or x)(data)
+        True False
+    """
+    compiling = torch.compiler.is_compiling()
+    return not compiling and torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+
+
 def is_recorded(tensor: Tensor) -> bool:
     """Returns whether the values of a tensor are missing, or stand for others.
 

@@ -139,6 +139,7 @@ class ContinuousCQLLoss(CQLLoss):
             min_q_weight=min_q_weight,
             num_random=num_random,
         )
+        self.set_keys(action=action_key)
         self.reduction = reduction or "mean"
         self.action_key = action_key
         self.over_critics = over_critics
@@ -170,7 +171,7 @@ class ContinuousCQLLoss(CQLLoss):
             without a reduction; "alpha" (the temperature) and "entropy" (of the policy, estimated),
             float [].
         """
-        batch_dims = tensordict.get(self.tensor_keys.action).ndim - 1
+        batch_dims = tensordict[self.tensor_keys.action].ndim - 1
         if tensordict.ndim > batch_dims:  # dispatch takes all that the entries have in common
             tensordict.auto_batch_size_(batch_dims)
         batch = self.sample_policy(tensordict)
