@@ -217,7 +217,10 @@ def test_all_tasks_and_networks_train_with_one_set_of_settings() -> None:
 
 
 def test_all_pictures_train_with_one_set_of_settings() -> None:
-    """And nothing in it depends on the number of steps, so a short run begins as a long one."""
+    """But for TIT's on MinAtar, which reads pixels as they are.
+
+    Nothing in it depends on the number of steps, so a short run begins as a long one.
+    """
     recipes = [get_recipe(name) for name in PICTURES if not name.endswith(PAPERS)]
     assert len({recipe.env for recipe in recipes}) == 4 + 5
     one = PPO(env="one", backbone=mlp(), **PICTURE_SETTINGS)
@@ -225,6 +228,10 @@ def test_all_pictures_train_with_one_set_of_settings() -> None:
         "env": "one", "env_settings": (), "backbone": mlp(), "total_steps": one.total_steps,
         "name": "", "image_layout": "auto",
     }  # fmt: skip
+    raw = [recipe for recipe in recipes if not recipe.normalize_observations]
+    tit = [name for name in PICTURES if name.startswith("ppo/minatar") and "tit" in name]
+    assert sorted(recipe.name for recipe in raw) == sorted(tit)
+    same["normalize_observations"] = True
     assert {replace(recipe, **same) for recipe in recipes} == {one}
     assert not one.schedules
     assert not one.warmup_steps
