@@ -43,6 +43,8 @@ class Agent:
             if (missing.reshape(len(frames), -1).any(1) & self.first).any():
                 raise ValueError("the first observation of an episode is missing or has NaN")
             frames = np.where(missing, self.last, frames)
+        if not np.isfinite(np.asarray(reward, float)).all():
+            raise ValueError(f"the reward is {reward}, not a finite number")
         kind = self.facts["inputs"]["observation"]["dtype"]
         converted = frames.astype(kind)
         if kind != "float32" and (converted != frames).any():

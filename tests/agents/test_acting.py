@@ -26,6 +26,7 @@ from tests.recipes.ppo import tasks as ppo_tasks
 from tests.recipes.small import make_dt, tit, train
 from torchrl_tit import load_agent
 from torchrl_tit.agents import agent_names
+from torchrl_tit.agents.acting import Actor
 from torchrl_tit.envs.names import load_wrappers
 from torchrl_tit.export import export_policy
 from torchrl_tit.settings.literals import parse_assignments
@@ -128,6 +129,42 @@ def test_missing_values_are_held(made):
         agent.act(np.array(["a"] * 11))
     with pytest.raises(ValueError, match="there are 2 rewards, but 1 copies"):
         agent.act(frames[0], reward=[1.0, 2.0])
+    agent.reset()
+    with pytest.raises(ValueError, match="observations of 0 copies"):
+        agent.act(np.zeros((0, 11)))
+
+
+def test_what_is_refused_leaves_nothing_behind(made, tmp_path):
+    agent, frames = made("dt"), np.random.default_rng(0).normal(size=(3, 11))
+    expected = [agent.act(frame) for frame in frames]
+    agent.reset()
+    for frame, action in zip(frames, expected, strict=True):
+        for reward in (np.nan, -np.inf, None):
+            with pytest.raises(ValueError, match="not a finite number"):
+                agent.act(frame, reward=reward)
+        np.testing.assert_array_equal(agent.act(frame), action)
+    lake = PPO(env="FrozenLake-v1", backbone=mlp(3, hidden_dim=8), evaluation_episodes=1)
+    agent = load_agent(make_run(tmp_path / "run", lake))
+    expected = [agent.act(state) for state in (0, 4, 8, 9)]  # numbers, as Gymnasium has them
+    agent.reset()
+    for state, action in zip((0, 4, 8, 9), expected, strict=True):
+        with pytest.raises(ValueError, match=r"is \[\[16\]\], which its space lacks"):
+            agent.act([16])
+        assert agent.act([state]) == action
+
+
+def test_only_reset_begins_an_episode(tmp_path):
+    """And no time limit of the task that the agent was trained on."""
+    limit = "torchrl.envs.transforms:StepCounter(max_steps=3)"
+    backbone = mlp(2, hidden_dim=8)
+    recipe = PPO(env="Pendulum-v1", wrappers=(limit,), backbone=backbone, evaluation_episodes=1)
+    agent = load_agent(make_run(tmp_path / "run", recipe))
+    actor = Actor(agent.policy, agent.make_env)
+    frames = np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32)
+    for before, frame in zip([frames[0], *frames], frames):  # noqa: B905 (one is longer)
+        actor.act(frame)
+        assert actor._steps is not None
+        np.testing.assert_array_equal(actor._steps["history"][0], [before, frame])
 
 
 def test_masks_of_several_choices(tmp_path):
@@ -146,6 +183,8 @@ def test_masks_of_several_choices(tmp_path):
     assert action.tolist() == (space.nvec - 1 + space.start).tolist(), "the last of each"
     agent.reset()
     assert (agent.act(observation, action_mask=np.concatenate(masks)) == action).all()
+    with pytest.raises(ValueError, match="action_mask must be 0 or 1 for each action"):
+        agent.act(observation, action_mask=np.concatenate(masks) * np.nan)
     with pytest.raises(ValueError, match="action_mask has the shape"):
         agent.act(observation, action_mask=masks[0])
     with pytest.raises(ValueError, match="action_mask allows no action: give every copy"):
@@ -226,6 +265,9 @@ def test_a_file_acts_as_its_agent(made, tmp_path, name):
     for frames in (np.zeros(2 * size), np.zeros((3, 2 * size)), np.zeros((2, 3, size))):
         with pytest.raises(ValueError, match="expected observations"):
             exported.act(frames)
+    for act, reward in product((agent.act, exported.act), (np.nan, np.inf)):
+        with pytest.raises(ValueError, match="not a finite number"):
+            act(np.zeros((3, size)), reward=reward)
     for act, value in product((agent.act, exported.act), (np.inf, -np.inf, 1e300)):
         with np.errstate(over="ignore"), pytest.raises(ValueError, match="is infinite in"):
             act(np.full((3, size), value))

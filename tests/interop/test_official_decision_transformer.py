@@ -196,5 +196,8 @@ def test_what_does_not_fit_is_named(kind: str) -> None:
         from_official({"kind": kind, "activation": "softplus"}, params)
     with pytest.raises(ValueError, match="num_frames 60 is more than max_ep_len 50"):
         from_official({"kind": kind, "context": 60}, params)
+    for entry, meant in {"n_heads": "n_head", "activation_function": "activation"}.items():
+        with pytest.raises(ValueError, match=f"has no '{entry}': write '{meant}"):
+            from_official({"kind": kind, entry: 1}, params)
     with pytest.raises(ValueError, match=r"there is no parameter"):
         from_official({"kind": kind}, {})

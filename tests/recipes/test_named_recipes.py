@@ -221,7 +221,7 @@ def test_all_pictures_train_with_one_set_of_settings() -> None:
 
     Nothing in it depends on the number of steps, so a short run begins as a long one.
     """
-    recipes = [get_recipe(name) for name in PICTURES if not name.endswith(PAPERS)]
+    recipes: list[Any] = [get_recipe(n) for n in PICTURES if not n.endswith(PAPERS)]
     assert len({recipe.env for recipe in recipes}) == 4 + 5
     one = PPO(env="one", backbone=mlp(), **PICTURE_SETTINGS)
     same: dict[str, Any] = {

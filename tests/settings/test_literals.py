@@ -20,6 +20,7 @@ def test_assignments():
         (["a"], "expected NAME=VALUE, .*not 'a'"),
         (["a.b=1"], "not 'a.b=1'"),
         (["a=1", "a=2"], "a is set twice, the second time by 'a=2'"),
+        (["a=false"], "'a=false' would be text: write a=False"),
     ],
 )
 def test_assignments_that_are_none(given, words):

@@ -17,6 +17,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_tit.envs.given import Feed, GivenTask
+from torchrl_tit.modules.action_specs import describe
 from torchrl_tit.networks.building import evaluating
 
 _READ = ("observation", "action_mask")
@@ -86,8 +87,8 @@ class Actor:
         Raises:
             ValueError: if the observation lacks a name, has another shape, is infinite, or has
                 numbers that its integers cannot hold, the number of copies changes without
-                :meth:`reset`, there is no last value to hold, or the mask is missing or has another
-                size.
+                :meth:`reset`, there is no last value to hold, the reward is not finite, or the mask
+                is missing, has another size, or allows nothing.
         """
         if self._env is None:
             self._start(observation)
@@ -98,6 +99,8 @@ class Actor:
                 raise ValueError("the agent reads which actions are allowed: give action_mask")
             if isinstance(action_mask, tuple):  # Gymnasium's of several choices
                 action_mask = np.concatenate(action_mask, -1)
+            if not np.isin(action_mask, (0, 1)).all():
+                raise ValueError(f"action_mask must be 0 or 1 for each action, not {action_mask}")
             mask = torch.as_tensor(np.asarray(action_mask, bool))
             shape = self._env.observation_spec["action_mask"].shape
             if mask.numel() != shape.numel():
@@ -112,6 +115,8 @@ class Actor:
             raise ValueError(
                 f"there are {len(rewards)} rewards, but {copies} copies: give {copies}"
             )
+        if not rewards.isfinite().all():
+            raise ValueError(f"the reward is {reward}, not a finite number, which later steps read")
         given["reward"] = rewards.expand(copies, 1)
         given["truncated"] = self._begins
         self._given = given
@@ -122,8 +127,11 @@ class Actor:
         ):
             if self._steps is None:
                 steps = self._env.reset()
-            else:  # also resets the copies in which an episode begins
-                _, steps = self._env.step_and_maybe_reset(self._steps)
+            else:  # also resets the copies in which an episode begins, and no others
+                steps = self._env.step(self._steps)
+                for name in ("done", "truncated", "terminated"):
+                    steps["next", name] = self._begins
+                steps = self._env.maybe_reset(self._env.step_mdp(steps))
             self._steps = self._policy(steps)
         taken = self._env.transform.inv(self._steps.copy())["action"]  # as the environment does
         action = self._to_task(taken.cpu()).numpy()
@@ -145,6 +153,8 @@ class Actor:
         ndim = (spec[name] if several else spec).ndim
         self._batched = first.ndim > ndim
         copies = len(first) if self._batched else 1
+        if not copies:
+            raise ValueError("there are observations of 0 copies: give those of at least one")
         writer = getattr(base, "action_writer", None)
         self._to_task: Callable[[Tensor], Tensor] = writer or (lambda action: action)
         self._env = _given(base, transforms, lambda begins: self._given, copies)
@@ -168,6 +178,8 @@ class Actor:
             frame = torch.zeros(shape, dtype=spec.dtype)
         else:
             array = np.asarray(value)
+            if spec.shape == (1,) and not self._batched:  # Gymnasium's categories are numbers
+                array = array.reshape(array.shape or 1)
             if array.dtype.kind not in "biuf":
                 raise ValueError(f"the {name} must be numbers, not {array.dtype}")
             if array.shape != (shape if self._batched else shape[1:]):
@@ -201,6 +213,10 @@ class Actor:
                 )
             assert last is not None
             frame = torch.where(missing, last, frame)
+        if not spec.dtype.is_floating_point and not spec.expand(shape).is_in(frame):
+            raise ValueError(
+                f"the {name} is {frame.tolist()}, which its space lacks: {describe(spec)}"
+            )
         self._last[name] = frame
         return frame
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from difflib import get_close_matches
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -54,8 +55,8 @@ def from_official(config: Mapping[str, Any], params: Mapping[str, Tensor]) -> nn
         timesteps and attention_mask, and return the actions.
 
     Raises:
-        ValueError: if the kind is unknown, an entry is missing, or parameters are missing,
-            unexpected or of another shape.
+        ValueError: if the kind is unknown, an entry is missing or misspelled, or parameters are
+            missing, unexpected or of another shape.
 
     Example:
         >>> import torch
@@ -75,15 +76,35 @@ def from_official(config: Mapping[str, Any], params: Mapping[str, Tensor]) -> nn
     marker, build = _KINDS[kind]
     # The authors' causal masks are parameters too; ours are not.
     params = {n: x for n, x in strip_prefix(params, marker).items() if "mask" not in n}
+    config = _Entries(config)
     try:
         network, params, renaming = build(config, params)
     except KeyError as error:
         raise ValueError(f"the config of kind {kind!r} has no entry {error}: {config}") from error
     load_renamed(network, params, renaming)
+    for name in config.keys() - config.read - {"share_blocks"}:  # which the parameters tell
+        if similar := get_close_matches(name, config.read - config.keys(), 1):
+            raise ValueError(f"a config of kind {kind!r} has no {name!r}: write {similar[0]!r}")
     if kind in ("ofenet", "d2rl") or (kind, config.get("observation")) == ("tit", "array"):
         # The authors' arrays have no history axis.
         return nn.Sequential(nn.Unflatten(-1, (1, -1)), network)
     return network
+
+
+class _Entries(dict[str, Any]):
+    """A config that remembers which of its entries were read."""
+
+    def __init__(self, config: Mapping[str, Any]) -> None:
+        super().__init__(config)
+        self.read: set[str] = set()
+
+    def __getitem__(self, name: str) -> Any:
+        self.read.add(name)
+        return super().__getitem__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        self.read.add(name)
+        return super().get(name, default)
 
 
 _TIT_REQUIRED = (

@@ -18,7 +18,8 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
         The values by name.
 
     Raises:
-        ValueError: if an assignment has another form, or a name occurs twice.
+        ValueError: if an assignment has another form, a name occurs twice, or a value is "true",
+            "false" or "none".
 
     Example:
         >>> parse_assignments(["is_slippery=False", "map_name=8x8", "sizes=(3, 4)"])
@@ -35,6 +36,8 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
         try:
             values[name] = ast.literal_eval(text.strip())
         except (SyntaxError, ValueError, MemoryError, RecursionError):  # or nested too deeply
+            if (literal := text.strip().capitalize()) in ("True", "False", "None"):
+                raise ValueError(f"{assignment!r} would be text: write {name}={literal}") from None
             values[name] = text.strip()
     return values
 
