@@ -16,7 +16,7 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_tit.envs.given import Feed, GivenTask
+from torchrl_tit.envs.given import Feed, GivenEnds, GivenTask
 from torchrl_tit.modules.action_specs import describe
 from torchrl_tit.networks.building import evaluating
 
@@ -127,11 +127,8 @@ class Actor:
         ):
             if self._steps is None:
                 steps = self._env.reset()
-            else:  # also resets the copies in which an episode begins, and no others
-                steps = self._env.step(self._steps)
-                for name in ("done", "truncated", "terminated"):
-                    steps["next", name] = self._begins
-                steps = self._env.maybe_reset(self._env.step_mdp(steps))
+            else:  # also resets the copies in which an episode begins
+                _, steps = self._env.step_and_maybe_reset(self._steps)
             self._steps = self._policy(steps)
         taken = self._env.transform.inv(self._steps.copy())["action"]  # as the environment does
         action = self._to_task(taken.cpu()).numpy()
@@ -267,4 +264,4 @@ def _specs(base: EnvBase) -> dict[str, TensorSpec]:
 
 def _given(base: EnvBase, transforms: Compose, feed: Feed, num_envs: int) -> EnvBase:
     task = GivenTask(_specs(base), base.action_spec_unbatched, feed, num_envs, device=base.device)
-    return TransformedEnv(task, transforms)
+    return TransformedEnv(task, transforms).append_transform(GivenEnds())

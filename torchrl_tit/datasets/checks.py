@@ -13,10 +13,11 @@ from gymnasium.envs.registration import parse_env_id
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 from torch import Tensor
-from torchrl.data import Composite
-from torchrl.envs import Compose, Transform
+from torchrl.data import Unbounded
+from torchrl.envs import Compose, Transform, TransformedEnv
 
 from torchrl_tit.envs import is_atari, make_games
+from torchrl_tit.envs.given import GivenTask
 from torchrl_tit.envs.gymnasium_tasks import make_unchecked
 from torchrl_tit.envs.names import find_task, load_wrappers
 from torchrl_tit.envs.spaces import ObservationReader, only_space
@@ -127,9 +128,12 @@ def _transformed(space: Space, transforms: Sequence[Transform], layout: ImageLay
     """The space of what the transforms make of an observation."""
     if not transforms:
         return space
-    before = Composite(observation=ObservationReader(space, image_layout=layout).spec)
-    after = Compose(*transforms).transform_observation_spec(before.clone())["observation"]
-    if after == before["observation"]:
+    before = ObservationReader(space, image_layout=layout).spec
+    task = GivenTask(
+        {"observation": before}, Unbounded(1), lambda begins: {}
+    )  # some ask for a task
+    after = TransformedEnv(task, Compose(*transforms)).observation_spec_unbatched["observation"]
+    if after == before:
         return space
     if after.dtype == torch.uint8:
         return Box(0, 255, tuple(after.shape), np.uint8)

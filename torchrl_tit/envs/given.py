@@ -10,7 +10,7 @@ import torch
 from gymnasium.spaces import Box, Discrete, Space
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite, TensorSpec, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, Transform
 
 from torchrl_tit.envs.actions import ActionWriter
 from torchrl_tit.envs.spaces import array_spec, end_flags
@@ -77,8 +77,8 @@ class GivenTask(EnvBase):
     def _given(self, begins: bool) -> TensorDict:
         given, zeros = dict(self.feed(begins)), torch.zeros(*self.batch_size, 1)
         truncated = zeros.bool() if begins else given.get("truncated", zeros.bool())
-        flags = {"truncated": truncated, "terminated": zeros.bool(), "done": truncated.clone()}
-        entries = given | flags | ({} if begins else {"reward": given.get("reward", zeros)})
+        self.ends = {"truncated": truncated, "terminated": zeros.bool(), "done": truncated.clone()}
+        entries = given | self.ends | ({} if begins else {"reward": given.get("reward", zeros)})
         return TensorDict(entries, self.batch_size, device=self.device)
 
     def render(self) -> np.ndarray:
@@ -93,6 +93,14 @@ class GivenTask(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         pass
+
+
+class GivenEnds(Transform):
+    """Ends episodes of a :class:`GivenTask` where its feed does: time limits of the task do not."""
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        assert self.parent is not None
+        return next_tensordict.update(self.parent.base_env.ends)
 
 
 @checked_arguments

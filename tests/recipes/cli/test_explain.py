@@ -238,6 +238,18 @@ def test_a_recorded_episode(tmp_path, capsys, explained):
         assert message in fails(capsys, "explain", run.folder, *more)
 
 
+def test_a_time_limit_of_the_task_does_not_cut_a_recorded_episode(tmp_path, explained):
+    pytest.importorskip("captum")
+    limit = "torchrl.envs.transforms:StepCounter(max_steps=3)"
+    recipe = make_ppo("Pendulum-v1", enhanced_tit(3, **TIT), wrappers=(limit,))
+    observations, actions = np.random.default_rng(0).normal(size=(200, 3)), np.zeros((200, 1))
+    data = log_machine(tmp_path / "log.hdf5", observations=observations, actions=actions)
+    run = untrained(tmp_path / "run", recipe)
+    explain(run.folder, "--dataset", data, "--step", 7, "--out", tmp_path / "step.png")
+    [history] = [one["history"][0].numpy() for one in explained]
+    np.testing.assert_array_equal(history, observations[5:8].astype(np.float32))
+
+
 def test_recorded_episodes_are_those_of_the_agents_task(tmp_path, capsys, explained):
     """As it writes them: categories are counted from 0, and floats are none."""
     pytest.importorskip("captum")
