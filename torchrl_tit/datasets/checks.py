@@ -125,13 +125,11 @@ def task_spaces(
 
 
 def _transformed(space: Space, transforms: Sequence[Transform], layout: ImageLayout) -> Space:
-    """The space of what the transforms make of an observation."""
+    """The space of what transforms, some of which ask for a task, make of an observation."""
     if not transforms:
         return space
     before = ObservationReader(space, image_layout=layout).spec
-    task = GivenTask(
-        {"observation": before}, Unbounded(1), lambda begins: {}
-    )  # some ask for a task
+    task = GivenTask({"observation": before}, Unbounded(1), lambda begins: {})
     after = TransformedEnv(task, Compose(*transforms)).observation_spec_unbatched["observation"]
     if after == before:
         return space
