@@ -38,8 +38,8 @@ def measure(env: str, seed: int, total_steps: int) -> list[object]:
     agent.learn(total_steps)
     [returns] = envs.env_method("get_episode_rewards")
     [lengths] = envs.env_method("get_episode_lengths")
-    ends, fifth = accumulate(lengths), 0.8 * total_steps
-    last = [x for x, end in zip(returns, ends, strict=True) if end > fifth]
+    ends, begin = accumulate(lengths), 0.8 * total_steps  # of the last fifth
+    last = [x for x, end in zip(returns, ends, strict=True) if end > begin]
     evaluated, _ = evaluate_policy(
         agent,
         make_vec_env(env, seed=EVALUATION_SEED),

@@ -81,10 +81,10 @@ def from_official(config: Mapping[str, Any], params: Mapping[str, Tensor]) -> nn
         network, params, renaming = build(config, params)
     except KeyError as error:
         raise ValueError(f"the config of kind {kind!r} has no entry {error}: {config}") from error
-    load_renamed(network, params, renaming)
-    for name in config.keys() - config.read - {"share_blocks"}:  # which the parameters tell
+    for name in sorted(config.keys() - config.read - {"share_blocks"}):  # which the parameters tell
         if similar := get_close_matches(name, config.read - config.keys(), 1):
             raise ValueError(f"a config of kind {kind!r} has no {name!r}: write {similar[0]!r}")
+    load_renamed(network, params, renaming)
     if kind in ("ofenet", "d2rl") or (kind, config.get("observation")) == ("tit", "array"):
         # The authors' arrays have no history axis.
         return nn.Sequential(nn.Unflatten(-1, (1, -1)), network)

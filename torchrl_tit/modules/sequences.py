@@ -199,8 +199,8 @@ def step_episodes(
         }
 
     length = begins.shape[-1]
-    marked = () if mapped else begins.reshape(-1, length).any(0).nonzero().flatten().tolist()
-    cuts = range(length) if mapped else sorted({0, *marked})
+    marked = torch.arange(length) if mapped else begins.reshape(-1, length).any(0).nonzero()
+    cuts = sorted({0, *marked.flatten().tolist()})
     now = {key: x.select(time, 0) for key, x in state.items()}
     for first, end in pairwise([*cuts, length]):
         stored = {key: x.select(time, first) for key, x in state.items()}
