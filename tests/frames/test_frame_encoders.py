@@ -130,3 +130,5 @@ def test_each_patch_has_weights_of_its_own(patch_size: int) -> None:
         patch = padded[..., index * patch_size : (index + 1) * patch_size].flatten(1)
         expected = patch @ embedding.weight[index].flatten(1).t() + embedding.bias[index]
         torch.testing.assert_close(tokens[:, index], expected)
+    pixels = torch.randint(256, observation.shape, dtype=torch.uint8)
+    torch.testing.assert_close(embedding(pixels), embedding(pixels / 255))

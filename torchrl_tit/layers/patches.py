@@ -81,9 +81,8 @@ class ArrayPatchEmbedding(nn.Module):
         x = x[..., : self.num_patches * self.patch_size]  # padding both ends may leave a remainder
         x = x.unflatten(-1, (self.num_patches, self.patch_size))  # [N, C, patches, P]
         patches = x.transpose(1, 2).flatten(2)  # [N, patches, C * P]
-        if self.bias is None:
-            return embed(patches, self.weight)
-        return torch.einsum("npe,pde->npd", patches, self.weight.flatten(2)) + self.bias
+        tokens = embed(patches, self.weight.flatten(-2))
+        return tokens if self.bias is None else tokens + self.bias
 
 
 class ImagePatchEmbedding(nn.Module):
@@ -141,18 +140,20 @@ class ImagePatchEmbedding(nn.Module):
         rows, columns = self.grid
         x = x.unflatten(-1, (columns, self.patch_size)).unflatten(-3, (rows, self.patch_size))
         # [N, C, rows, P, columns, P] -> [N, rows, columns, C, P, P]; moves bytes instead of floats
-        return embed(x.permute(0, 2, 4, 1, 3, 5).flatten(3).flatten(1, 2), self.weight)
+        return embed(x.permute(0, 2, 4, 1, 3, 5).flatten(3).flatten(1, 2), self.weight.flatten(1))
 
 
 def embed(patches: Tensor, weight: Tensor) -> Tensor:
-    """Maps patches [N, patches, entries] to tokens with a weight [width, ...] over their entries.
+    """Maps patches [N, patches, entries] to tokens [N, patches, width].
 
-    Bytes are scaled to 0..1: the division by 255 is applied to the weights, which are fewer.
+    The weight is [width, entries], or [patches, width, entries]. Bytes are scaled to 0..1: the
+    division by 255 is applied to the weights, which are fewer.
     """
-    weight = weight.flatten(1)
     if patches.dtype == torch.uint8:
-        return F.linear(patches.to(weight.dtype), weight / 255)
-    return F.linear(patches, weight)
+        patches, weight = patches.to(weight.dtype), weight / 255
+    if weight.ndim == 2:
+        return F.linear(patches, weight)
+    return torch.einsum("npe,pde->npd", patches, weight)
 
 
 def find_patch_size(
