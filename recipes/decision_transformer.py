@@ -29,6 +29,7 @@ from torchrl_tit.evaluation import evaluate
 from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.histories.decision_transformer import DecisionTransformer
 from torchrl_tit.modules import DTHead, make_dt_actor, make_dt_predictor
+from torchrl_tit.modules.decision_transformer import ActionPredictor
 from torchrl_tit.networks import HistoryNetwork, build_network
 from torchrl_tit.objectives import MaskedDTLoss
 from torchrl_tit.settings.networks import decision_transformer
@@ -131,20 +132,6 @@ class SequenceRecipe(DatasetRecipe):
 RecipeT = TypeVar("RecipeT", bound=SequenceRecipe)
 
 
-class SequenceModel(nn.Module):
-    """Network and head.
-
-    Args:
-        network: predicts features.
-        head: maps features to actions.
-    """
-
-    def __init__(self, network: HistoryNetwork, head: DTHead) -> None:
-        super().__init__()
-        self.network = network
-        self.head = head
-
-
 class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
     """An algorithm that trains a Decision Transformer on windows of a data set.
 
@@ -158,7 +145,7 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
     action_padding = -10.0
     """Value of the actions at padding; no loss reads it."""
 
-    model: SequenceModel
+    model: ActionPredictor
 
     def __init__(self, recipe: RecipeT) -> None:
         super().__init__(recipe)
@@ -172,7 +159,7 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
             self.model = self.networks(task).to(self.device).eval()
         self._policy = make_dt_actor(self.model.network, self.model.head)
 
-    def networks(self, env: EnvBase) -> SequenceModel:
+    def networks(self, env: EnvBase) -> ActionPredictor:
         """Builds network and head, and what a subclass adds to them.
 
         Args:
@@ -190,7 +177,7 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
         encoder = network.history_encoder
         assert isinstance(encoder, DecisionTransformer)
         encoder.return_scale.fill_(recipe.return_scale)
-        return SequenceModel(
+        return ActionPredictor(
             network, DTHead(network.features_dim, self.action_dim, recipe.action_space)
         )
 

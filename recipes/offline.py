@@ -315,9 +315,10 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
         starts = torch.arange(0, count + stride - 1, stride).clamp(max=count - 1)
         index = starts.unsqueeze(-1) + torch.arange(length) if length > 1 else starts
         sums, total = dict.fromkeys(self.measures, 0.0), 0
+        gpus = range(torch.cuda.device_count() if torch.cuda.is_initialized() else 0)
         with (
             ExitStack() as modes,
-            torch.random.fork_rng(range(torch.cuda.device_count())),
+            torch.random.fork_rng(gpus),
             torch.no_grad(),
             set_exploration_type(ExplorationType.DETERMINISTIC),
         ):

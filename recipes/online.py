@@ -24,7 +24,7 @@ from torchrl_tit.settings.numbers import Batch, Copies, Fraction, Steps
 
 from .core.algorithm import Algorithm
 from .core.networks import state_transforms
-from .core.ray_cluster import ask_for_machines, check_address, check_room
+from .core.ray_cluster import ask_for_machines, check_room
 from .core.recipe import Recipe
 from .core.task import make_task, seed_copies
 
@@ -59,7 +59,14 @@ class OnlineRecipe(Recipe):
         super().__post_init__()
         self.check_divides("num_envs", "steps_per_batch", self.steps_per_batch)
         self.check_divides("collectors", "num_envs", self.num_envs)
-        check_address(self)
+        if self.ray == "":
+            raise ValueError("ray is empty: it is the address of a Ray cluster, such as auto")
+        if self.ray is not None and self.ray.startswith("ray://"):
+            raise ValueError(
+                f"ray is {self.ray!r}, an address for programs outside the cluster, but collectors "
+                "get their weights straight from the training process: start it on a machine of "
+                "the cluster, with auto or HOST:PORT"
+            )
 
     @property
     def final_step(self) -> int:

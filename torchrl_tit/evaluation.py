@@ -217,7 +217,8 @@ def _acting(policy: Policy, seed: int, deterministic: bool) -> Iterator[None]:
     exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     mode = evaluating(policy) if isinstance(policy, nn.Module) else nullcontext()
     python_state, numpy_state = random.getstate(), np.random.get_state()
-    devices = range(torch.cuda.device_count())
+    # Unused GPUs have no generators, and asking for one would initialize CUDA on all of them.
+    devices = range(torch.cuda.device_count() if torch.cuda.is_initialized() else 0)
     try:
         with (
             torch.random.fork_rng(devices),

@@ -241,28 +241,24 @@ def export(arguments: list[str]) -> None:
 
     find_format(options.out).check_installed()  # before an agent is loaded
     agent = load_agent(options.agent, best=options.best)
+    recipe: Any = agent.recipe
     facts = export_policy(
         agent.policy,
         agent.make_env,
         options.out,
         step_by_step=options.step_by_step,
         sample=options.sample,
-        facts=_facts(agent.recipe, agent.steps),
+        facts={
+            "task": {"id": recipe["env"], **parse_assignments(recipe["env_settings"])},
+            "wrappers": list(recipe["wrappers"]),
+            "recipe": recipe["name"],
+            "steps": agent.steps,
+        },
     )
     say(
         f"{agent.name}: {', '.join(facts['inputs'])} -> {', '.join(facts['outputs'])}; differs by "
         f"{facts['difference']:.0e} at most\nwritten to {options.out}"
     )
-
-
-def _facts(recipe: Any, steps: int) -> dict[str, Any]:
-    """Further facts about an agent: its task, as `gymnasium.make` takes it, and its origin."""
-    return {
-        "task": {"id": recipe["env"], **parse_assignments(recipe["env_settings"])},
-        "wrappers": list(recipe["wrappers"]),
-        "recipe": recipe["name"],
-        "steps": steps,
-    }
 
 
 def share(arguments: list[str]) -> None:

@@ -14,7 +14,6 @@ import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from torchrl_tit.extras import missing
 from torchrl_tit.settings.imports import allowed_modules
@@ -122,21 +121,3 @@ def import_variables() -> dict[str, str]:
         "PYTHONPATH": os.pathsep.join(folders),
         "TORCHRL_TIT_IMPORTS": os.pathsep.join(modules),
     }
-
-
-def check_address(recipe: Any) -> None:
-    """Checks the field ``ray`` of a recipe.
-
-    Raises:
-        ValueError: if it is empty, or an address for processes outside the cluster.
-    """
-    if recipe.ray is None:
-        return
-    if not recipe.ray:
-        raise ValueError("ray is empty: it is the address of a Ray cluster, such as auto")
-    if recipe.ray.startswith("ray://"):
-        raise ValueError(
-            f"ray is {recipe.ray!r}, an address for programs outside the cluster, but collectors "
-            "get their weights straight from the training process: start it on a machine of the "
-            "cluster, with auto or HOST:PORT"
-        )

@@ -23,7 +23,7 @@ from torchrl_tit.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from torchrl_tit.evaluation_file import EVALUATION, parse_evaluation, read_evaluation
+from torchrl_tit.evaluation_file import EVALUATION, parse_evaluation
 from torchrl_tit.files import remove_leftovers, write_text_atomic
 from torchrl_tit.settings.imports import allowed_modules
 
@@ -151,13 +151,17 @@ class Run:
         path = self.folder / name
         return path.read_bytes() if path.is_file() else None
 
-    def read_evaluation(self) -> dict[str, Any] | None:
-        """Reads and checks the run's evaluation; None if there is none.
+    def read_evaluation(self, name: str = EVALUATION) -> dict[str, Any] | None:
+        """Reads and checks an evaluation of the run; None if there is none.
+
+        Args:
+            name: its file.
 
         Raises:
             ValueError: if it is damaged; the message names the file.
         """
-        return read_evaluation(self.folder)
+        content = self.read(name)
+        return None if content is None else parse_evaluation(content, self.folder)
 
     def lengthen(self, length: int) -> None:
         """Changes the length of an open run; training then continues to the new end.
@@ -358,11 +362,6 @@ class RecordedRun(Run):
         """Reads a file of the run, as far as the table holds it."""
         return self._records.read(self._run, name)
 
-    def read_evaluation(self) -> dict[str, Any] | None:
-        """Reads and checks the run's evaluation; None if there is none."""
-        content = self.read(EVALUATION)
-        return None if content is None else parse_evaluation(content, self.folder)
-
     @property
     def initial_weights(self) -> str:
         """As :attr:`Run.initial_weights`."""
@@ -376,17 +375,14 @@ def locked(folder: Path) -> Iterator[None]:
     Raises:
         RuntimeError: if another process has locked it.
     """
-    lock = filelock.FileLock(folder / ".lock", timeout=0)
     try:
-        lock.acquire()
+        held = filelock.FileLock(folder / ".lock", timeout=0).acquire()
     except filelock.Timeout as error:
         raise RuntimeError(
             f"{folder} is in use by another process: wait for it, or stop it"
         ) from error
-    try:
+    with held:
         yield
-    finally:
-        lock.release()
 
 
 def _import_hint(folder: Path) -> str:

@@ -182,10 +182,8 @@ class _SeededCopies(BatchedEnvBase):
 class SerialTasks(_SeededCopies, SerialEnv):
     """Copies of a task that are stepped one after the other."""
 
-    @property
-    def render_fps(self) -> int:
-        """The task's frames per second."""
-        return 30
+    render_fps = 30
+    """Frames per second of a film."""
 
     def render(self) -> np.ndarray:
         """Renders the copies; uint8 [N, height, width, 3].
@@ -263,12 +261,10 @@ def _copy(
             "gymnasium.Wrapper."
         )
     parameters = inspect.signature(make).parameters
-    limit = None
-    if "max_episode_steps" not in parameters:
-        limit = settings.get("max_episode_steps")
-        settings = {key: value for key, value in settings.items() if key != "max_episode_steps"}
-    if "render_mode" not in parameters:  # it renders in its own way
-        settings = {key: value for key, value in settings.items() if key != "render_mode"}
+    limit = None if "max_episode_steps" in parameters else settings.get("max_episode_steps")
+    # It may lack a limit, and renders in its own way.
+    unknown = {"max_episode_steps", "render_mode"} - {*parameters}
+    settings = {key: value for key, value in settings.items() if key not in unknown}
     try:
         env = make(**settings)
     except Exception as error:  # an environment can raise anything

@@ -115,12 +115,8 @@ class InnerTransformer(FrameEncoder):
         class_tokens = []
         for index in range(self.num_blocks):
             last = index == self.num_blocks - 1
-            x = self._block(index)(x, read="first" if last else "all", mask=mask)
+            block = self.blocks[index % len(self.blocks)]
+            x = block(x, read="first" if last else "all", mask=mask)
             if last or self.every_block:
                 class_tokens.append(x[:, 0])
         return torch.stack(class_tokens, dim=1).reshape(*leading, self.num_tokens, self.width)
-
-    def _block(self, index: int) -> TransformerBlock:
-        block = self.blocks[index % len(self.blocks)]
-        assert isinstance(block, TransformerBlock)
-        return block

@@ -12,48 +12,8 @@ from torch import Tensor, nn
 
 from torchrl_tit.interop.weights import Renaming, count_layers, size_of
 from torchrl_tit.modules import DTHead
-from torchrl_tit.networks import DTTIT, DecisionTransformer, HistoryNetwork
-
-
-class ActionPredictor(nn.Module):
-    """Decision Transformer and its head, with the interface of the authors' network.
-
-    Args:
-        network: computes features.
-        head: maps features to actions.
-    """
-
-    def __init__(self, network: HistoryNetwork, head: DTHead) -> None:
-        super().__init__()
-        self.network = network
-        self.head = head
-
-    def forward(
-        self,
-        states: Tensor,
-        actions: Tensor,
-        returns_to_go: Tensor,
-        timesteps: Tensor,
-        attention_mask: Tensor | None = None,
-    ) -> Tensor:
-        """Predicts the action of every step from the past.
-
-        Args:
-            states: float [..., K, S].
-            actions: float [..., K, A].
-            returns_to_go: float [..., K, 1].
-            timesteps: int64 [..., K].
-            attention_mask: [..., K], 0 or False at padding.
-
-        Returns:
-            float [..., K, A].
-        """
-        inputs = [states, actions, returns_to_go, timesteps]
-        if attention_mask is not None:
-            inputs.append(attention_mask)
-        features = self.network.every_frame(*inputs)
-        return self.head(features)
-
+from torchrl_tit.modules.decision_transformer import ActionPredictor
+from torchrl_tit.networks import DTTIT, DecisionTransformer
 
 _HISTORY = "network.history_encoder"
 _FRAME = "network.frame_encoders.observation"

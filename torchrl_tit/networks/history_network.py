@@ -332,23 +332,10 @@ def build_network(
         >>> build_network(NETWORKS["enhanced-tit"](4), (4,))(torch.randn(2, 4, 4)).shape
         torch.Size([2, 64])
     """
+    arguments = arguments_of(settings, observation, action_dim)
     if (trunks or settings.trunks) == "separate":
-        policy, value = (build_trunk(settings, observation, action_dim) for _ in range(2))
-        return TwoTrunks(policy, value)
-    return build_trunk(settings, observation, action_dim)
-
-
-def build_trunk(
-    settings: settings.Network, observation: Observations, action_dim: int | None = None
-) -> HistoryNetwork:
-    """Builds a single network, whether or not the settings share it between policy and value.
-
-    Args:
-        settings: those of the network.
-        observation: shape or spec of an observation, or of each by name if there are several.
-        action_dim: entries of an action, for history encoders that read actions.
-    """
-    return HistoryNetwork(**arguments_of(settings, observation, action_dim))
+        return TwoTrunks(HistoryNetwork(**arguments), HistoryNetwork(**arguments))
+    return HistoryNetwork(**arguments)
 
 
 def arguments_of(

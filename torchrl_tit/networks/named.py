@@ -10,12 +10,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 from torchrl_tit.frames.observation import Observations
-from torchrl_tit.networks.history_network import (
-    HistoryNetwork,
-    TwoTrunks,
-    arguments_of,
-    build_trunk,
-)
+from torchrl_tit.networks.history_network import HistoryNetwork, TwoTrunks, arguments_of
 from torchrl_tit.settings import Network, networks
 
 __all__ = [
@@ -205,7 +200,8 @@ class NamedTrunks(_Named, TwoTrunks):
         self, observation_shape: Observations, num_frames: int = 1, **hyperparameters: Any
     ) -> None:
         settings = self.describe(num_frames=num_frames, **hyperparameters)
-        super().__init__(*(build_trunk(settings, observation_shape) for _ in range(2)))
+        arguments = arguments_of(settings, observation_shape)
+        super().__init__(HistoryNetwork(**arguments), HistoryNetwork(**arguments))
 
 
 class MLP(NamedTrunks, describe=networks.mlp):

@@ -13,7 +13,7 @@ import torch
 
 from torchrl_tit.agents import AgentError, TrainedAgent
 from torchrl_tit.agents.folder import RECIPE, AgentFiles
-from torchrl_tit.evaluation_file import BEST_EVALUATION, EVALUATION, parse_evaluation
+from torchrl_tit.evaluation_file import BEST_EVALUATION, EVALUATION
 from torchrl_tit.settings.choices import Device
 
 from ...core.algorithm import Algorithm, load_weights, make_algorithm
@@ -86,9 +86,8 @@ def agent_from_run(folder: Path, device: Device, *, best: bool = False) -> Train
 def evaluation_of(run: Run, steps: int | None, *, best: bool = False) -> dict[str, Any]:
     """Reads a run's evaluation of its last or best weights, of a step; empty if there is none."""
     with suppress(OSError, ValueError):
-        content = run.read(BEST_EVALUATION if best else EVALUATION)
-        evaluation = {} if content is None else parse_evaluation(content, run.folder)
-        if evaluation.get("steps") == steps:
+        evaluation = run.read_evaluation(BEST_EVALUATION if best else EVALUATION)
+        if evaluation is not None and evaluation["steps"] == steps:
             return evaluation
     return {}
 

@@ -12,7 +12,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -27,6 +26,7 @@ from torchrl_tit.networks.building import evaluating
 
 from .explained_page import Seen, as_picture, lay_over
 from .explanation import Explainer, MapKind, play_steps
+from .plot import new_figure
 
 Panel: TypeAlias = tuple[str, np.ndarray] | None
 """A title and what is drawn below it; None stays empty."""
@@ -220,8 +220,7 @@ def _play(
 
 
 def _grid(rows: int, columns: int) -> tuple[Figure, Any]:
-    figure = Figure(figsize=(1.6 * columns, 1.7 * rows + 0.4), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure((1.6 * columns, 1.7 * rows + 0.4))
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in figure.axes:
         axes.set_xticks([])

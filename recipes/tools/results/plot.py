@@ -10,7 +10,6 @@ from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from torchrl_tit.files import write_bytes_atomic
@@ -219,9 +218,7 @@ def add_legend(figure: Figure) -> None:
 
 def new_figure(size: tuple[float, float]) -> Figure:
     """Returns an empty figure of a width and a height in inches."""
-    figure = Figure(figsize=size, dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+    return Figure(figsize=size, dpi=120, layout="constrained")
 
 
 def save_figure(figure: Figure, picture: Path) -> None:

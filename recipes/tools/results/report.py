@@ -22,7 +22,6 @@ import imageio.v3 as imageio
 import jinja2
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from torchrl_tit import load_agent
 from torchrl_tit.agents import TrainedAgent
@@ -310,13 +309,18 @@ def _context(
     curves = [_chart(groups, column) for column in returns]
     common = common_part([group.experiment.name for group in groups]).rstrip("/")
     name = recipe.name if len(groups) == 1 else common if "/" in common else recipe.env
+    left_out = [  # by bold lines
+        line
+        for group in groups
+        for line in short_runs(group.label, {data.name: data.steps for data in group.runs})
+    ]
     return {
         "title": title or name or groups[0].label,
         "description": _description(groups),
         "version": package_versions()["torchrl-tit"],
         "date": time.strftime("%Y-%m-%d"),
         "unit": _unit(recipe),
-        "notes": notes + _short_runs(groups),
+        "notes": notes + left_out,
         "header": HEADER,
         "cells": [(to_columns(cell), cell.published) for cell in cells],
         "compared_header": comparison.HEADER,
@@ -386,7 +390,7 @@ def _chart(groups: Sequence[Group], column: str) -> tuple[Chart, dict[str, Curve
         for label, x in bold.items()
     ]
     alt = f"Line chart of {column} over {_unit(recipe)}. {'. '.join(texts)}."
-    return Chart(column, words, _svg(figure), alt, notes), bold
+    return Chart(column, words, _data("image/svg+xml", to_bytes(figure, "svg")), alt, notes), bold
 
 
 def _cut(axes: Axes, values: np.ndarray) -> bool:
@@ -459,15 +463,6 @@ def _description(groups: Sequence[Group]) -> str:
     )
 
 
-def _short_runs(groups: Sequence[Group]) -> list[str]:
-    """Names the runs that bold lines leave out."""
-    return [
-        line
-        for group in groups
-        for line in short_runs(group.label, {data.name: data.steps for data in group.runs})
-    ]
-
-
 def _settings(index: int, groups: Sequence[Group], media: Media) -> dict[str, Any]:
     """The settings of a group, how they differ from the recipe of that name, and the command."""
     group = groups[index]
@@ -530,10 +525,6 @@ def _unit(recipe: Recipe) -> str:
 
 def _text(value: Any) -> str:
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
-
-
-def _svg(figure: Figure) -> str:
-    return _data("image/svg+xml", to_bytes(figure, "svg"))
 
 
 def _data(kind: str, content: bytes) -> str:
