@@ -12,6 +12,7 @@ from torchrl_tit.networks import masked_predictions
 from torchrl_tit.objectives import contrastive_prediction_loss
 from torchrl_tit.settings import CoBERL
 from torchrl_tit.settings.numbers import Weight
+from torchrl_tit.windows import Windows
 
 from .ppo import PPO, Minibatch, PPOAlgorithm
 
@@ -53,11 +54,19 @@ class ContrastivePPOAlgorithm(PPOAlgorithm):
     terms = (*PPOAlgorithm.terms, "loss_contrastive")
 
     def loss(self, minibatch: Minibatch) -> TensorDictBase:
-        """Adds the contrastive loss, of a pass of its own, because its attention is not causal."""
-        terms, (_, frames, windows) = super().loss(minibatch), minibatch
+        """Adds the contrastive loss, of a pass of its own, because its attention is not causal.
+
+        Its windows do not overlap, unless sequences are shorter than a window, since it would
+        contrast a frame with its own copies.
+        """
+        terms, (_, frames, (rows, missing, _)) = super().loss(minibatch), minibatch
+        length = min(rows.shape[-2:])
+        apart = slice(length - 1, None, length)
+        windows = Windows(rows[:, apart], None if missing is None else missing[:, apart])
         histories = [windows.gather(table).flatten(0, 1) for table in frames]
-        mask = torch.rand(histories[0].shape[:2], device=histories[0].device) < _MASKED
+        padding = windows.padded().flatten(0, 1)
+        mask = (torch.rand(padding.shape, device=padding.device) < _MASKED) & ~padding
         predictions = masked_predictions(self.model.backbone.module, histories, mask)
-        contrast = contrastive_prediction_loss(*predictions, mask)
+        contrast = contrastive_prediction_loss(*predictions, mask, padding)
         terms["loss_contrastive"] = self.recipe.contrastive_coeff * contrast
         return terms

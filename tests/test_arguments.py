@@ -258,10 +258,8 @@ def discrete_cql(**settings: Any) -> DelayedDiscreteCQLLoss:
     return DelayedDiscreteCQLLoss(actor, action_space="categorical", **settings)
 
 
-def contrast(temperature: float = 0.1, mask: torch.Tensor = MASK, width: int = 6) -> torch.Tensor:
-    return contrastive_prediction_loss(
-        SEQUENCES, SEQUENCES[..., :width], mask, temperature=temperature
-    )
+def contrast(mask: torch.Tensor = MASK, width: int = 6, **settings: Any) -> torch.Tensor:
+    return contrastive_prediction_loss(SEQUENCES, SEQUENCES[..., :width], mask, **settings)
 
 
 CALLS: list[tuple[Callable[[], object], str]] = [
@@ -307,6 +305,10 @@ CALLS: list[tuple[Callable[[], object], str]] = [
     (lambda: contrast(temperature=NAN), "temperature must be positive, not nan"),
     (lambda: contrast(width=5), r"encodings and predictions must be \[N, K, D\]"),
     (lambda: contrast(mask=torch.ones(2, 3)), "mask must be bool, not torch.float32"),
+    (
+        lambda: contrast(padding=MASK[:, 1:]),
+        r"padding must be bool \[2, 3\], not torch.bool \[2, 2",
+    ),
     (lambda: EnhancedTIT(4), "observation_shape 4 is not that of an array"),
     (lambda: EnhancedTIT((4,), patch_size=1000), "patch_size 1000 is larger than the array of"),
     (lambda: EnhancedTIT((4,), position_encoding="no"), "'position_encoding' is 'no': Expec"),

@@ -115,6 +115,19 @@ def test_equals_the_formula(temperature):
     torch.testing.assert_close(gradient, theirs)
 
 
+def test_padding_counts_nowhere():
+    torch.manual_seed(0)
+    given = torch.randn(2, 3, 4, 5, dtype=torch.float64).requires_grad_()
+    padding = torch.tensor([[True, True, False, False], [False] * 4, [True, False, False, False]])
+    mask = torch.tensor([[True, False, False, True], [False] * 4, [False, True, False, False]])
+    loss = contrastive_prediction_loss(given[0], given[1], mask, padding)
+    left = given[:, ~padding].unsqueeze(1)  # one history of the others
+    expected = contrastive_prediction_loss(left[0], left[1], mask[~padding].unsqueeze(0))
+    torch.testing.assert_close(loss, expected)
+    (gradient,), (theirs,) = (torch.autograd.grad(x, given) for x in (loss, expected))
+    torch.testing.assert_close(gradient, theirs)
+
+
 def test_the_loss_is_zero_without_masked_steps():
     tensors = torch.randn(2, 2, 3, 4, requires_grad=True)
     mask = torch.zeros(2, 3, dtype=torch.bool)

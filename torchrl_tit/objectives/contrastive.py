@@ -12,7 +12,12 @@ from torchrl_tit.settings.numbers import Positive
 
 @checked_arguments
 def contrastive_prediction_loss(
-    encodings: Tensor, predictions: Tensor, mask: Tensor, *, temperature: Positive = 0.1
+    encodings: Tensor,
+    predictions: Tensor,
+    mask: Tensor,
+    padding: Tensor | None = None,
+    *,
+    temperature: Positive = 0.1,
 ) -> Tensor:
     r"""Contrasts the predictions of masked steps with the encodings of all steps of a batch.
 
@@ -34,6 +39,9 @@ def contrastive_prediction_loss(
         encodings: y, float [N, K, D], see :func:`~torchrl_tit.networks.masked_predictions`.
         predictions: x, float [N, K, D].
         mask: bool [N, K], True where a step was masked.
+        padding: bool [N, K], True where a history repeats a step or has none; it counts neither as
+            a masked step nor among the steps i. Histories should not share steps either: the
+            copies of a step are told apart from it, which cannot succeed.
         temperature: divides the similarities.
 
     Returns:
@@ -56,12 +64,21 @@ def contrastive_prediction_loss(
         )
     if mask.dtype != torch.bool:
         raise ValueError(f"mask must be bool, not {mask.dtype}")
+    if padding is None:
+        padding = torch.zeros_like(mask)
+    if padding.dtype != torch.bool or padding.shape != mask.shape:
+        raise ValueError(
+            f"padding must be bool {list(mask.shape)}, not {padding.dtype} {list(padding.shape)}"
+        )
     x = F.normalize(predictions.flatten(0, 1), dim=-1)  # [N * K, D]
     y = F.normalize(encodings.flatten(0, 1), dim=-1)
     similarity = x @ y.T / temperature  # [N * K, N * K]
+    absent = padding.flatten()
+    least = torch.finfo(similarity.dtype).min  # infinity would make the divergence NaN
+    similarity = similarity.masked_fill(absent | absent.unsqueeze(-1), least)
     log_p_x, log_p_y = similarity.log_softmax(-1), similarity.T.log_softmax(-1)
     agreement = F.kl_div(log_p_x, log_p_y.detach(), reduction="none", log_target=True).sum(-1)
     loss = agreement - log_p_x.diagonal() - log_p_y.diagonal()  # [N * K]
-    masked = mask.flatten()
+    masked = mask.flatten() & ~absent
     # Selecting rows would make shapes depend on the data, which cannot be compiled.
     return torch.where(masked, loss, 0).sum() / masked.sum().clamp(min=1)

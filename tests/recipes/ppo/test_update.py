@@ -21,7 +21,7 @@ from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.networks import masked_predictions
 from torchrl_tit.objectives import contrastive_prediction_loss
 from torchrl_tit.settings.networks import coberl, enhanced_tit, mlp
-from torchrl_tit.windows import Windows
+from torchrl_tit.windows import Windows, find_windows
 
 RECIPE = PPO(
     env="CartPole-v1",
@@ -196,6 +196,37 @@ def test_the_contrastive_loss_is_added_with_its_weight(tmp_path):
     torch.testing.assert_close(terms, expected_terms, rtol=1e-4, atol=1e-5)
     gradient = torch.autograd.grad(total, network.history_encoder.mask_token)
     assert gradient[0].any()
+
+
+def test_the_contrastive_loss_reads_each_frame_once_and_no_padding(tmp_path, monkeypatch):
+    recipe = replace(named("ppo/pong/coberl-tuned"), backbone=COBERL, num_envs=1, compile="off")
+    algorithm = prepared(recipe, tmp_path)
+    newest = torch.arange(20).view(2, 10)
+    oldest = torch.tensor([0, 0, 0, 0, 0, 0, 6, 6, 6, 6]) + torch.tensor([[0], [10]])
+    seen = []
+
+    def look(network, histories, mask):
+        seen.append((histories[0], mask))
+        return masked_predictions(network, histories, mask)
+
+    monkeypatch.setattr("recipes.coberl.masked_predictions", look)
+    monkeypatch.setattr("recipes.coberl._MASKED", 1.0)
+    frames = torch.arange(20, dtype=torch.uint8).view(20, 1, 1).expand(20, 84, 84)
+    steps = TensorDict(
+        {
+            "action": torch.randint(0, 6, (2, 10)),
+            "action_log_prob": -torch.rand(2, 10),
+            "advantage": torch.randn(2, 10, 1),
+            "value_target": torch.randn(2, 10, 1),
+        },
+        [2, 10],
+    )
+    for padding in ("same", "constant"):
+        windows = find_windows(newest, oldest, 4, padding)
+        algorithm.loss(Minibatch(steps.copy(), [frames], windows))
+        histories, mask = seen.pop()
+        read = histories[..., 0, 0][mask].tolist()
+        assert read == [0, 1, 2, 3, 6, 7, 10, 11, 12, 13, 16, 17]
 
 
 def test_parameters_stay_views_when_weights_are_loaded():
