@@ -157,13 +157,23 @@ class Algorithm(ABC, Generic[RecipeT]):
         return None
 
     def check(self) -> None:
-        """Lets the policy act once, and makes other cheap checks before a run starts.
+        """Takes one step with the policy, and makes other cheap checks before a run starts.
 
         Raises:
-            ValueError: if environment, networks and data do not match.
+            ValueError: if environment, wrappers, networks and data do not match.
         """
-        with closing(self.make_env(1, self.recipe.seed)) as env, torch.no_grad():
-            self.policy(env.reset())
+        recipe = self.recipe
+        with closing(self.make_env(1, recipe.seed)) as env, torch.no_grad():
+            try:
+                env.step(self.policy(env.reset()))
+            except Exception as error:  # a wrapper can raise anything
+                if not recipe.wrappers:
+                    raise
+                # The text of a KeyError would be one long line.
+                reason = str(*error.args[:1]).partition("\n")[0] or type(error).__name__
+                raise ValueError(
+                    f"the wrappers {list(recipe.wrappers)} do not fit {recipe.task_name}: {reason}"
+                ) from error
 
     def close(self) -> None:
         """Closes the environments and processes that :meth:`prepare` started."""

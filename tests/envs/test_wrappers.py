@@ -88,6 +88,8 @@ def test_names_in_modules():
             "FlattenObservation' stands after a TorchRL transform",
         ),
         ("ALE/Pong-v5", [FLATTEN], "read in one way"),
+        ("ALE/Pong-v5", ["torchrl.envs:StepCounter(max_steps=9)"], "ends a game .* that goes on"),
+        ("ALE/Pong-v5", ["torchrl.envs:RewardScaling(loc=0, scale=2)"], "changes the rewards of"),
         ("CartPole-v1", ["torchrl.envs:FrameSkipTransform"], "has ended, and loses its end"),
         ("CartPole-v1", ["torchrl.envs:EndOfLifeTransform"], "games here step together"),
     ],

@@ -133,6 +133,16 @@ REFUSED: list[tuple[Recipe, dict[str, Any], str]] = [
         {"wrappers": ("gymnasium.wrappers:NormalizeObservation",)},
         "which neither evaluations .* would have: use the field normalize_observations instead",
     ),
+    (
+        DQN_RECIPE,
+        {"wrappers": ("gymnasium.wrappers:TransformReward(func=1)",)},
+        r"\['gymnasium.wrappers:TransformReward\(func=1\)'\] do not fit CartPole-v1: 'int' object",
+    ),
+    (
+        DQN_RECIPE,
+        {"wrappers": ("torchrl.envs:FlattenObservation(first_dim=-2, last_dim=-1)",)},
+        "do not fit CartPole-v1: .*'pixels' not found",
+    ),
     (DQN_RECIPE, {"updates_per_step": 0.05}, "times steps_per_batch 10 is 0.5 gradient steps: mak"),
     (DQN_RECIPE, {"updates_per_step": 0.25}, "0.25 times steps_per_batch 10 is 2.5 gradient steps"),
     (DQN_RECIPE, {"buffer_size": 5}, "buffer_size 5 has no room for a batch of 10 steps"),

@@ -131,5 +131,7 @@ def _captum() -> type[Any]:
     try:
         from captum.attr import IntegratedGradients  # an optional extra
     except ImportError as error:
-        raise ValueError(f"integrated gradients need captum: {install('captum')}") from error
+        raise ValueError(
+            f"integrated gradients need captum: {install('captum')} ({error})"
+        ) from error
     return IntegratedGradients

@@ -8,7 +8,16 @@ from typing import Any
 import gymnasium
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    RandomTruncationTransform,
+    RewardSum,
+    StepCounter,
+    TerminateTransform,
+    Transform,
+    TransformedEnv,
+)
 
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.envs.atari import FRAME_SKIP, MAX_NUM_FRAMES, AtariEnv, AtariGames
@@ -148,6 +157,8 @@ def make_env(
             raise ValueError(
                 f"{name} runs in threads, side by side; leave vectorization_mode at 'sync'."
             )
+        for wrapper, transform in zip(wrappers, transforms, strict=True):
+            _check_keeps_games(name, wrapper, transform)
         env = AtariEnv(make_games(name, num_envs, **kwargs), device=device)
     else:
         task = find_task(name)
@@ -179,6 +190,21 @@ def make_env(
     env.append_transform(RewardSum())
     env.append_transform(History(num_frames, keys_of(env), padding=padding))
     return env
+
+
+def _check_keeps_games(name: str, wrapper: str, transform: Transform) -> None:
+    """Raises ValueError if a transform changes the rewards or the ends of an Atari game."""
+    ends = isinstance(transform, RandomTruncationTransform | TerminateTransform)
+    if ends or (isinstance(transform, StepCounter) and transform.max_steps):
+        raise ValueError(
+            f"Wrapper {wrapper!r} ends a game of {name} that goes on, and its score counts whole "
+            "games: limit them with max_num_frames_per_episode (4 frames a step)"
+        )
+    if "reward" in transform.out_keys:
+        raise ValueError(
+            f"Wrapper {wrapper!r} changes the rewards of {name}, but not its score, which is the "
+            "game's own: leave it out (ppo and dqn recipes have clip_rewards)"
+        )
 
 
 def _check_fit(env: EnvBase, name: str, wrappers: Sequence[str]) -> None:
@@ -319,7 +345,7 @@ def make_games(name: str, num_envs: int = 1, **kwargs: Any) -> AtariGames:
     try:
         import ale_py  # an optional extra
     except ImportError as error:
-        raise ValueError(f"Task {name!r} needs ale-py: {install('ale_py')}.") from error
+        raise ValueError(f"Task {name!r} needs ale-py: {install('ale_py')} ({error}).") from error
     gymnasium.register_envs(ale_py)
     if name not in gymnasium.registry:
         raise unknown(name)

@@ -11,8 +11,9 @@ def init_normal_(module: nn.Module, std: float = 0.02) -> None:
     """Initializes like the authors' networks: linear and embedding weights normal, biases 0.
 
     LayerNorms become 1 and 0. Convolutions, patch embeddings and the input projections of
-    attention keep PyTorch's defaults; class tokens and position encodings are initialized by their
-    modules. (The authors use a truncated normal, whose absolute bounds do not matter at 0.02.)
+    attention keep PyTorch's defaults, except those of Transformer-XL's attention (GTrXL, CoBERL),
+    which are linear layers; class tokens and position encodings are initialized by their modules.
+    (The authors use a truncated normal, whose absolute bounds do not matter at 0.02.)
 
     Args:
         module: the network, changed in place.
@@ -39,7 +40,7 @@ def init_orthogonal_(module: nn.Module, gain: float = 2**0.5) -> None:
     The weights of every linear layer (including output projections of attention) and 2-d
     convolution (including image patch embeddings) become orthogonal, their biases 0. The array
     patch embedding, a 1-d convolution there, and the input projections of attention are left
-    unchanged.
+    unchanged, except those of Transformer-XL's attention (GTrXL, CoBERL), which are linear layers.
 
     Args:
         module: the network, changed in place.

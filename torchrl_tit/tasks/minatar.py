@@ -39,7 +39,7 @@ def make_game(game: str, render_mode: str | None = None, **settings: Any) -> gym
     try:
         from minatar.gym import BaseEnv  # an optional extra
     except ImportError as error:
-        raise ValueError(missing("minatar")) from error
+        raise ValueError(f"{missing('minatar')} ({error})") from error
 
     class Game(BaseEnv):
         metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
