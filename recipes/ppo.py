@@ -100,7 +100,8 @@ class PPO(OnlineRecipe, algorithm="ppo"):
     learning_rate: Rate = 3e-4
     """Learning rate of Adam, before it is scaled by warm-up and decay."""
     decay_learning_rate: bool = False
-    """Whether the learning rate falls linearly to 0 over the run."""
+    """Whether the learning rate falls linearly to 0 over the run. The first update has all of it;
+    Stable-Baselines3 counts the steps of its batch already, and is an update ahead."""
     warmup_steps: StepsOrNone = 0
     """Environment steps over which the learning rate rises linearly from 0."""
     adam_eps: Weight = 1e-5
@@ -110,7 +111,7 @@ class PPO(OnlineRecipe, algorithm="ppo"):
     clip_epsilon: Fraction = 0.2
     """Clipping range of the probability ratio, before it decays."""
     decay_clip_epsilon: bool = False
-    """Whether the clipping range falls linearly to 0 over the run."""
+    """Whether the clipping range falls linearly to 0 over the run, as the learning rate does."""
     entropy_coeff: Real = 0.0
     """Weight of the entropy bonus, before it decays."""
     decay_entropy_coeff: bool = False

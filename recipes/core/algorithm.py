@@ -183,12 +183,23 @@ def make_algorithm(recipe: Recipe) -> Algorithm[Any]:
     """Builds the algorithm of a recipe.
 
     Raises:
-        ValueError: if its networks cannot be built with these settings.
+        ValueError: if its networks cannot be built with these settings, or it has a module with
+            weights that are not among those of its model.
     """
     try:
-        return recipe.build()
+        algorithm = recipe.build()
     except TypeError as error:  # for example, no network here reads this kind of observation
         raise ValueError(str(error)) from error
+    networks = (algorithm.model, algorithm.policy)
+    saved = {weight.data_ptr() for part in networks for weight in part.parameters()}
+    for name, part in vars(algorithm).items():
+        weights = part.parameters() if isinstance(part, nn.Module) else ()
+        if any(weight.requires_grad and weight.data_ptr() not in saved for weight in weights):
+            raise ValueError(
+                f"{type(algorithm).__name__}.{name} has weights that are neither trained nor "
+                "saved: put it into what networks() returns"
+            )
+    return algorithm
 
 
 def torch_device(device: str) -> torch.device:

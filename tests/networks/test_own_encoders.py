@@ -39,6 +39,15 @@ class Own(FrameEncoder):
         if self.wrong == "leading":
             tokens = tokens.reshape(len(observation), -1)
             return self.norm(tokens).unflatten(-1, (2, 8))
+        if self.wrong == "double":
+            tokens = tokens.double()
+        if self.wrong == "noise":
+            tokens = nn.functional.dropout(tokens)  # also in evaluation mode
+        if self.wrong == "state":
+            self.calls = getattr(self, "calls", 0) + 1
+            tokens = tokens + self.calls
+        if self.wrong == "batch":
+            tokens = tokens - tokens.mean(1, keepdim=True)
         return self.dropout(tokens).unflatten(-1, (2, 8))
 
 
@@ -61,10 +70,11 @@ class OwnPast(HistoryEncoder):
 
     def __init__(self, settings, shape):
         super().__init__(shape, out_features=9 if settings.wrong == "out_features" else 8)
-        self.linear = nn.Linear(shape.width, 8)
+        self.linear, self.wrong = nn.Linear(shape.width, 8), settings.wrong
 
     def forward(self, tokens):
-        return self.linear(tokens[..., -1, 0, :])
+        newest = self.linear(tokens[..., -1, 0, :])
+        return newest - newest.mean(0) if self.wrong == "batch" else newest
 
 
 class MeanPast(HistoryEncoder):
@@ -146,6 +156,11 @@ def test_settings_and_shape_are_enough(wrong):
          r"not to \(1, 2, 2, 8\): it must map .* to tokens \[..., num_tokens, width\]"),
         (OwnFrames(wrong="type"), (4,), r"Own maps zeros of shape \(1, 2, 4\) to list, not to"),
         (OwnFrames(wrong="leading"), (4,), r"Own fails on zeros of shape \(1, 2, 4\): "),
+        (OwnFrames(wrong="double"), (4,), "Own maps zeros .* to torch.float64, not to torch"),
+        (OwnFrames(wrong="noise"), (4,), "Own gives the same input another output at the"),
+        (OwnFrames(wrong="state"), (4,), "Own gives the same input another output at the"),
+        (OwnFrames(wrong="batch"), (4,), "the output of Own for one entry of a batch depends"),
+        (OwnHistory(wrong="batch"), (4,), "the output of OwnPast for one entry of a batch depends"),
         (OwnFrames(), (3, 8, 8), r"tests-own frames do not read an image of shape \(3, 8, 8\)"),
         (OwnFrames(), CATEGORIES, r"do not read a row of categories \(4 values\)"),
         (OtherFrames(), (4,), "builds a NoEncoder, which is no FrameEncoder: derive it from "

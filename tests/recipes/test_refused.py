@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.spaces import Box, MultiDiscrete
 
 from recipes.core.algorithm import make_algorithm
@@ -17,6 +18,7 @@ from recipes.core.registry import get_recipe
 from recipes.cql import CQL, DiscreteCQL
 from recipes.dqn import DQN
 from recipes.iql import IQL
+from recipes.ppo import PPO, PPOAlgorithm
 from recipes.sac import SAC
 from recipes.td3bc import TD3BC
 from tests.datasets.rollouts import roll, write
@@ -255,3 +257,17 @@ def test_networks_that_fit_after_all() -> None:
     replace(PPO_RECIPE, sequence_length=5, backbone=mlp())  # which has no use for it
     with pytest.raises(ValueError, match="num_frames"):
         enhanced_tit(1, temporal_positions="learned")
+
+
+class Loose(PPOAlgorithm):
+    def networks(self, env):
+        self.predictor = torch.nn.Linear(4, 2)
+        return super().networks(env)
+
+
+def test_weights_that_would_be_neither_trained_nor_saved(monkeypatch) -> None:
+    monkeypatch.setattr(PPO, "build", lambda recipe: Loose(recipe))
+    with pytest.raises(ValueError, match=r"Loose\.predictor has weights that are neither"):
+        make_algorithm(PPO_RECIPE)
+    monkeypatch.setattr(Loose, "networks", PPOAlgorithm.networks)
+    make_algorithm(PPO_RECIPE)

@@ -66,6 +66,15 @@ class Observation:
         dtype = torch.int64 if self.categories is not None else self.dtype
         return torch.zeros(*leading, *self.shape, dtype=dtype)
 
+    def draw(self, *leading: int) -> torch.Tensor:
+        """Draws observations like :meth:`zeros`: floats from 0 to 1, any bytes and categories."""
+        drawn, dtype = torch.rand(*leading, *self.shape), self.zeros().dtype
+        if self.categories is not None:
+            drawn = drawn * torch.tensor(self.categories)
+        elif dtype == torch.uint8:
+            drawn = drawn * 256
+        return drawn.to(dtype)
+
     def __str__(self) -> str:
         """Describes it for error messages, such as "an image of shape (3, 7, 7)"."""
         if self.categories is not None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import torch
@@ -78,6 +79,7 @@ def build_frame(frame: settings.FrameSettings, observation: Observation) -> Fram
             encoder,
             ("num_tokens", "width"),
             observation.zeros(1, 2),
+            partial(observation.draw, 2, 2),
             "map [..., *observation_shape] to tokens [..., num_tokens, width]",
         )
     return encoder
@@ -95,10 +97,12 @@ def build_history(history: settings.HistorySettings, shape: HistoryShape) -> His
     """
     encoder = _build(history, HistoryEncoder, shape)
     if _is_own(history) and not encoder.context and not history.is_recurrent:  # reads only tokens
+        tokens = (shape.num_frames, shape.num_tokens, shape.width)
         _check_output(
             encoder,
             ("out_features",),
-            torch.zeros(1, 2, shape.num_frames, shape.num_tokens, shape.width),
+            torch.zeros(1, 2, *tokens),
+            partial(torch.rand, 2, 2, *tokens),
             "map [..., K, L, D] to [..., out_features]",
         )
     return encoder
@@ -148,9 +152,13 @@ def _build(part: settings.Part, base: type[Any], *args: Any, **kwargs: Any) -> A
 
 
 def _check_output(
-    encoder: nn.Module, attributes: tuple[str, ...], zeros: Tensor, contract: str
+    encoder: nn.Module,
+    attributes: tuple[str, ...],
+    zeros: Tensor,
+    draw: Callable[[], Tensor],
+    contract: str,
 ) -> None:
-    """Encodes zeros once, and raises ValueError if the output is not the promised one."""
+    """Encodes zeros, then what is drawn, [2, 2, ...]; raises ValueError if the output is wrong."""
     name, base = type(encoder).__name__, type(encoder).__mro__[1]
     if not all(attribute in vars(encoder) for attribute in ("_modules", *attributes)):
         raise BrokenEncoderError(
@@ -162,13 +170,36 @@ def _check_output(
     inputs = f"zeros of shape {tuple(zeros.shape)}"
     with evaluating(encoder), torch.random.fork_rng(devices=[]), torch.no_grad():
         try:
-            output = encoder(zeros)
+            output, given = encoder(zeros), draw()
+            inputs = f"inputs of shape {tuple(given.shape)}"
+            first, again = encoder(given.clone()), encoder(given.clone())
+            alone = encoder(given[:1, :1].clone())
         except Exception as error:
             raise ValueError(f"{name} fails on {inputs}: {_reason(error)}") from error
+    inputs = f"zeros of shape {tuple(zeros.shape)}"
     got = tuple(output.shape) if isinstance(output, Tensor) else type(output).__name__
     expected = (1, 2, *(getattr(encoder, attribute) for attribute in attributes))
     if got != expected:
         raise ValueError(f"{name} maps {inputs} to {got}, not to {expected}: it must {contract}")
+    default = torch.get_default_dtype()
+    if output.is_floating_point() and output.dtype != default:
+        raise ValueError(f"{name} maps {inputs} to {output.dtype}, not to {default}")
+    if not _are_close(first, again):
+        raise ValueError(
+            f"{name} gives the same input another output at the next call, in evaluation mode: it "
+            "must depend on its input alone, without noise and without what it was called with "
+            "before"
+        )
+    if not _are_close(first[:1, :1], alone):
+        raise ValueError(
+            f"the output of {name} for one entry of a batch depends on the others: it must read "
+            "each by itself (nn.BatchNorm does in evaluation mode)"
+        )
+
+
+def _are_close(one: Tensor, other: Tensor) -> bool:
+    tolerance = 1e-4 * max(1.0, one.abs().max().item())
+    return torch.allclose(one.float(), other.float(), atol=tolerance, rtol=0, equal_nan=True)
 
 
 def _reason(error: Exception) -> str:

@@ -33,8 +33,11 @@ _KINDS: dict[str, type[BaseDistribution]] = {
     "int": IntDistribution,
 }
 # Fields that define the search, which therefore cannot vary them. A search has its own seeds, and
-# trials are comparable if they were evaluated in the same way.
-_FIXED = {"algorithm", "name", "seed", "evaluation_seed", "evaluation_episodes"}
+# trials are comparable if they had the same task or data, and were evaluated in the same way.
+_FIXED = {
+    *("algorithm", "name", "seed", "evaluation_seed", "evaluation_episodes"),
+    *("env", "env_settings", "wrappers", "hide_velocities", "dataset"),
+}
 
 
 def load_space(source: Path | None, recipe: Recipe) -> SearchSpace:
@@ -79,10 +82,24 @@ def make_distributions(space: SearchSpace) -> dict[str, BaseDistribution]:
     """
     made = {}
     for field, arguments in space.items():
-        if arguments["type"] not in _KINDS:
+        if not isinstance(arguments, dict) or "type" not in arguments:
+            raise ValueError(
+                f'{field} has {arguments!r}, not a range such as {{"type": "int", "low": 2, '
+                '"high": 8}'
+            )
+        kind = arguments["type"]
+        if kind not in _KINDS:
             raise ValueError(f"the type of {field} is none of {', '.join(_KINDS)}")
+        needed = ("choices",) if kind == "categorical" else ("low", "high")
+        if lacking := [name for name in needed if name not in arguments]:
+            raise ValueError(f"{field} has the type {kind}, but no {' and no '.join(lacking)}")
+        if not isinstance(arguments.get("choices", []), list):
+            raise ValueError(f"the choices of {field} are {arguments['choices']!r}, not a list")
         rest = {name: value for name, value in arguments.items() if name != "type"}
-        made[field] = _KINDS[arguments["type"]](**rest)
+        try:
+            made[field] = _KINDS[kind](**rest)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{field}: {error}") from error
     return made
 
 

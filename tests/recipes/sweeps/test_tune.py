@@ -220,6 +220,12 @@ def test_a_trial_below_the_median_is_pruned(tmp_path, naps, monkeypatch):
         ({"epochs": {"type": "int", "low": 3, "high": 1}}, "`low <= high` must hold"),
         ({"gamma": {"type": "uniform", "low": 0}}, "gamma is none of categorical, float, int"),
         ({"gamma": [1, 2]}, "is not a search space"),
+        ({"gamma": [1, 2]}, "gamma has [1, 2], not a range such as"),
+        ({"gamma": {"low": 0, "high": 1}}, "gamma has {'low': 0, 'high': 1}, not a range"),
+        ({"gamma": {"type": "float", "low": 0}}, "gamma has the type float, but no high"),
+        ({"gamma": {"type": "categorical", "choices": "abc"}}, "gamma are 'abc', not a list"),
+        ({"gamma": {"type": "float", "low": 0, "high": 1, "lag": True}}, "gamma: "),
+        ({"env": {"type": "categorical", "choices": ["Acrobot-v1"]}}, "unknown field 'env'"),
         ({}, "names no field"),
     ],
 )
