@@ -33,11 +33,9 @@ _KINDS: dict[str, type[BaseDistribution]] = {
     "int": IntDistribution,
 }
 # Fields that define the search, which therefore cannot vary them. A search has its own seeds, and
-# trials are comparable if they had the same task or data, and were evaluated in the same way.
-_FIXED = {
-    *("algorithm", "name", "seed", "evaluation_seed", "evaluation_episodes"),
-    *("env", "env_settings", "wrappers", "hide_velocities", "dataset"),
-}
+# trials are comparable if they were evaluated in the same way.
+_FIXED = {"algorithm", "name", "seed", "evaluation_seed", "evaluation_episodes"}
+_TASK = {"env", "env_settings", "wrappers", "hide_velocities", "dataset"}
 
 
 def load_space(source: Path | None, recipe: Recipe) -> SearchSpace:
@@ -70,6 +68,10 @@ def load_space(source: Path | None, recipe: Recipe) -> SearchSpace:
             # A float's ends need not be what lies between them.
             value = float(value) if arguments["type"] == "float" else value
             with_values(recipe, {field: value}, source)
+        if field in _TASK:
+            raise ValueError(
+                f"{source} searches {field!r}, but trials on other tasks or data cannot be compared"
+            )
     return space
 
 
