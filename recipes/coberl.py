@@ -56,8 +56,8 @@ class ContrastivePPOAlgorithm(PPOAlgorithm):
     def loss(self, minibatch: Minibatch) -> TensorDictBase:
         """Adds the contrastive loss, of a pass of its own, because its attention is not causal.
 
-        Its windows do not overlap, unless sequences are shorter than a window, since it would
-        contrast a frame with its own copies.
+        It reads windows that do not overlap (unless sequences are shorter than a window), because
+        otherwise a frame would be contrasted with its own copies.
         """
         terms, (_, frames, (rows, missing, _)) = super().loss(minibatch), minibatch
         length = min(rows.shape[-2:])
