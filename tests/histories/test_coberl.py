@@ -115,6 +115,13 @@ def test_equals_the_formula(temperature):
     torch.testing.assert_close(gradient, theirs)
 
 
+def test_it_compiles():
+    given, mask = torch.randn(2, 3, 4, 5), torch.rand(3, 4) < 0.5
+    compiled = torch.compile(contrastive_prediction_loss, backend="eager", fullgraph=True)
+    expected = contrastive_prediction_loss(given[0], given[1], mask, ~mask)
+    torch.testing.assert_close(compiled(given[0], given[1], mask, ~mask), expected)
+
+
 def test_padding_counts_nowhere():
     torch.manual_seed(0)
     given = torch.randn(2, 3, 4, 5, dtype=torch.float64).requires_grad_()

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchrl_tit.settings.checks import checked_arguments
-from torchrl_tit.settings.numbers import Positive
 
-
-@checked_arguments
 def contrastive_prediction_loss(
     encodings: Tensor,
     predictions: Tensor,
     mask: Tensor,
     padding: Tensor | None = None,
     *,
-    temperature: Positive = 0.1,
+    temperature: float = 0.1,
 ) -> Tensor:
     r"""Contrasts the predictions of masked steps with the encodings of all steps of a batch.
 
@@ -57,6 +55,9 @@ def contrastive_prediction_loss(
         >>> bool(right < 0.01 < wrong)
         True
     """
+    # By hand, since what checked_arguments adds cannot be compiled.
+    if not 0 < temperature < math.inf:
+        raise ValueError(f"temperature must be positive, not {temperature}")
     if not encodings.shape == predictions.shape or mask.shape != encodings.shape[:2]:
         raise ValueError(
             f"encodings and predictions must be [N, K, D] and mask [N, K], not "
