@@ -19,9 +19,10 @@ from .recipe import Compile
 P = ParamSpec("P")
 T = TypeVar("T")
 
-STATIC_SHAPES: dict[str, Any] = {"dynamic": False}
+STATIC_SHAPES: dict[str, Any] = {"dynamic": False, "isolate_recompiles": True}
 """Arguments of torch.compile: the choice of kernels must not depend on the sizes seen before, or a
-resumed run would differ in the last bit."""
+resumed run would differ in the last bit. Nor on other runs in the same process: by default, all
+that is compiled from one function shares its graphs, and the number of them is limited."""
 ONLY_TENSORS: dict[str, Any] = {
     **STATIC_SHAPES,
     "fullgraph": True,
@@ -29,7 +30,8 @@ ONLY_TENSORS: dict[str, Any] = {
 }
 """The same for functions where only tensors change between calls. Guards on everything else would
 take as long as several small layers, at every call. Where a graph breaks, code without guards would
-take one module for another, so it must be one graph."""
+take one module for another, so it must be one graph; and a run that shared it with another would
+take its numbers (heads, activations, weights of losses) for its own."""
 
 # Compiling takes about a minute, and each gradient step then saves a few milliseconds.
 _PAYS_FROM = 10_000

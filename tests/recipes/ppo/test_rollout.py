@@ -12,7 +12,7 @@ from torch._dynamo.utils import counters
 from torchrl.modules import RandomPolicy
 from torchrl.objectives.value import GAE
 
-from recipes.core.compilation import compile_and_time
+from recipes.core.compilation import ONLY_TENSORS, compile_and_time
 from recipes.core.runner import evaluate
 from recipes.ppo import PPO, ActorCritic, PPOAlgorithm
 from tests.modules.frames import CountedFrames
@@ -285,6 +285,26 @@ def test_the_compiled_objective_is_one_graph_and_the_eager_one(tmp_path):
         assert_near(*results)
     assert counters["stats"]["unique_graphs"]
     assert not counters["graph_break"]
+
+
+class Weighed:
+    """An algorithm whose loss has a number of its own."""
+
+    __module__ = "recipes.ppo"
+
+    def __init__(self, weight: float) -> None:
+        self.weight = weight
+
+    def loss(self, x: torch.Tensor) -> torch.Tensor:
+        return self.weight * x.sum()
+
+
+def test_two_runs_of_one_process_share_no_compiled_loss(monkeypatch):
+    monkeypatch.setitem(ONLY_TENSORS, "backend", "eager")
+    for weight in range(12):  # more than the entries that torch.compile keeps of a function
+        owner: Any = Weighed(weight)
+        loss = compile_and_time(owner.loss, "the loss", owner)
+        assert loss(torch.ones(3)) == loss(torch.ones(3)) == 3 * weight
 
 
 @pytest.mark.parametrize(
