@@ -44,6 +44,7 @@ NOT_RUN = "*open*"
 _PAGES = {
     "cartpole": "results/classic_control.md",
     "hopper": "results/classic_control.md",
+    "breakout": "results/breakout/records.csv",
     "pong": "results/pong/records.csv",
 }
 """What shows the tables of runs that have no page of their own name."""
