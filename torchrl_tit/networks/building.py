@@ -167,16 +167,15 @@ def _check_output(
         )
     if zeros.is_meta:
         return
-    inputs = f"zeros of shape {tuple(zeros.shape)}"
+    given, inputs = zeros, f"zeros of shape {tuple(zeros.shape)}"
     with evaluating(encoder), torch.random.fork_rng(devices=[]), torch.no_grad():
         try:
             output, given = encoder(zeros), draw()
-            inputs = f"inputs of shape {tuple(given.shape)}"
             first, again = encoder(given.clone()), encoder(given.clone())
             alone = encoder(given[:1, :1].clone())
         except Exception as error:
-            raise ValueError(f"{name} fails on {inputs}: {_reason(error)}") from error
-    inputs = f"zeros of shape {tuple(zeros.shape)}"
+            read = inputs if given is zeros else f"inputs of shape {tuple(given.shape)}"
+            raise ValueError(f"{name} fails on {read}: {_reason(error)}") from error
     got = tuple(output.shape) if isinstance(output, Tensor) else type(output).__name__
     expected = (1, 2, *(getattr(encoder, attribute) for attribute in attributes))
     if got != expected:
