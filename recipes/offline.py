@@ -38,6 +38,7 @@ from torchrl_tit.datasets.checks import check_actions, check_bytes, check_shape
 from torchrl_tit.datasets.episodes import memory_mapped_rows, rows_per_chunk
 from torchrl_tit.envs import make_env, observation_specs
 from torchrl_tit.envs.spaces import ObservationReader
+from torchrl_tit.evaluation import used_gpus
 from torchrl_tit.networks.building import evaluating
 from torchrl_tit.settings.choices import ImageLayout, Padding
 from torchrl_tit.settings.numbers import Batch, Fraction, Steps, Widths
@@ -315,10 +316,9 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
         starts = torch.arange(0, count + stride - 1, stride).clamp(max=count - 1)
         index = starts.unsqueeze(-1) + torch.arange(length) if length > 1 else starts
         sums, total = dict.fromkeys(self.measures, 0.0), 0
-        gpus = range(torch.cuda.device_count() if torch.cuda.is_initialized() else 0)
         with (
             ExitStack() as modes,
-            torch.random.fork_rng(gpus),
+            torch.random.fork_rng(used_gpus()),
             torch.no_grad(),
             set_exploration_type(ExplorationType.DETERMINISTIC),
         ):

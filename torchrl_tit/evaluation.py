@@ -211,17 +211,27 @@ def check_rewards(rewards: Tensor) -> None:
         raise FloatingPointError(f"the reward of copy {index[0]} is {rewards[index].item()}")
 
 
+def used_gpus() -> range:
+    """Returns the GPUs whose random generators may be in use; none if this process uses no CUDA.
+
+    Asking for a generator would initialize CUDA on every GPU.
+
+    Example:
+        >>> len(used_gpus()) <= torch.cuda.device_count()
+        True
+    """
+    return range(torch.cuda.device_count() if torch.cuda.is_initialized() else 0)
+
+
 @contextmanager
 def _acting(policy: Policy, seed: int, deterministic: bool) -> Iterator[None]:
     """Acts without gradients, and restores all modes and random generators at the end."""
     exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     mode = evaluating(policy) if isinstance(policy, nn.Module) else nullcontext()
     python_state, numpy_state = random.getstate(), np.random.get_state()
-    # Unused GPUs have no generators, and asking for one would initialize CUDA on all of them.
-    devices = range(torch.cuda.device_count() if torch.cuda.is_initialized() else 0)
     try:
         with (
-            torch.random.fork_rng(devices),
+            torch.random.fork_rng(used_gpus()),
             torch.no_grad(),
             set_exploration_type(exploration),
             mode,
