@@ -17,7 +17,7 @@ from torchrl_tit.evaluation import check_rewards
 from .algorithm import torch_device
 from .recipe import Recipe
 
-_PARAMETERS = inspect.signature(make_env).parameters
+_PARAMETERS = {*inspect.signature(make_env).parameters, "render_mode"}
 
 
 def make_task(
@@ -47,7 +47,7 @@ def make_task(
         if name in _PARAMETERS:
             raise ValueError(
                 f"env_settings are settings of {recipe.env} itself, and {name} is none: it is a "
-                "field of the recipe, or fixed by the algorithm"
+                "field of the recipe, or fixed by the algorithm or command"
             )
     device = torch_device(recipe.device)
     own = {

@@ -87,6 +87,7 @@ REFUSED: list[tuple[Recipe, dict[str, Any], str]] = [
     (PPO_RECIPE, {"backbone": enhanced_tit(num_heads_outer=5)}, "heads"),
     (PPO_RECIPE, {"mask_actions": True}, "no mask of its actions"),
     (PPO_RECIPE, {"env_settings": ("num_frames=3",)}, "num_frames is none: it is a field of the r"),
+    (PPO_RECIPE, {"env_settings": ("render_mode=human",)}, "render_mode is none: .* or command"),
     (PPO_RECIPE, {"env_settings": ("depth=3",)}, "cannot be made: TypeError: .*'depth'"),
     (PPO_RECIPE, {"backbone": decision_transformer()}, "reads actions and returns .* use a dt"),
     (
