@@ -350,7 +350,6 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
             partial(make_task, state=model.backbone.make_transforms(), keep_histories=False),
             step,
             FrameCollector,
-            use_buffers=False,  # they would hold the histories, which steps lack
             **alone if self.collects_here else {},
         )
 

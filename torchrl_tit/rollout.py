@@ -65,7 +65,6 @@ class Rollout:
         ...     frames_per_batch=64,
         ...     total_frames=64,
         ...     auto_register_policy_transforms=False,
-        ...     use_buffers=False,
         ... )
         >>> batch = next(iter(collector))
         >>> rollout = Rollout(batch, num_frames=4, padding="same")

@@ -278,6 +278,8 @@ def share(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     if options.repository is None and options.out is None:
         fail("share needs REPO, such as me/cartpole, or --out FOLDER")
+    if options.private and options.repository is None:
+        fail("--private is for REPO on the Hub: name it, such as me/cartpole")
     # Not at the top: help needs no PyTorch.
     from torchrl_tit.agents.folder import is_agent, write_agent
     from torchrl_tit.agents.hub import PREFIX, check_repository

@@ -31,7 +31,9 @@ def evaluate(arguments: list[str]) -> None:
         help="settings of the task; default: the recipe's",
     )
     parser.add_argument("--episodes", type=int, help="episodes; default: the recipe's")
-    parser.add_argument("--seed", type=int, help="seed of the first episode; default: the recipe's")
+    parser.add_argument(
+        "--seed", type=int, help="seed of the first episode, or of --ope; default: the recipe's"
+    )
     parser.add_argument(
         "--best",
         action="store_true",
@@ -81,8 +83,11 @@ def evaluate(arguments: list[str]) -> None:
         fail("--ope estimates returns from data: name them with --dataset FILE")
     if options.dataset is not None and (options.env or options.env_settings):
         fail("--env and --env-settings name what is played: leave them out where data are measured")
-    if options.episodes is not None and (options.dataset is not None or not recipe.env):
+    data_alone = options.dataset is not None or not recipe.env
+    if data_alone and options.episodes is not None:
         fail("--episodes are those that are played: leave it out where data are measured")
+    if data_alone and options.seed is not None and options.ope is None:
+        fail("--seed is for episodes or --ope: leave it out where data alone are measured")
     name = _file_name(run.recipe, recipe, options.best, options.dataset, options.ope)
     kept = [run.folder / own for own in (EVALUATION, BEST_EVALUATION) if own != name]
     if options.out is not None and options.out.resolve() in [file.resolve() for file in kept]:

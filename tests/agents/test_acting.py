@@ -34,7 +34,9 @@ from torchrl_tit.settings.networks import dt_tit, lstm, mlp
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "act_from_onnx.py"
 STEPS = 12
-OF_GYMNASIUM = [name for name in agent_names() if name not in ("breakout", "pong")]  # Atari: our own
+OF_GYMNASIUM = [
+    name for name in agent_names() if name not in ("breakout", "pong")
+]  # Atari: our own
 
 
 @pytest.fixture(scope="module")

@@ -131,6 +131,25 @@ def test_batches_of_several_workers_are_not_one_sequence() -> None:
         buffer.extend(worker.exclude("is_init"))
 
 
+def test_histories_that_would_be_replaced_by_others_are_refused() -> None:
+    """They tell where an episode goes on that would begin here, and how it is padded."""
+    steps = play_several(2, STEPS, 3, "constant")
+    done = steps["next", "done"].squeeze(-1).any(0)
+    before = 2 + int((~(done[:-1] | done[1:])).nonzero()[0])  # inside an episode of both
+    make(2, 90, 3, padding="constant").extend(steps)
+    make(2, 90, 3, padding="constant").extend(steps[:, before:].exclude("history"))
+    refused = pytest.raises(ValueError, match=r"Histories .* begin an episode .* a storage of its")
+    with refused:
+        make(2, 90, 3, padding="same").extend(steps)
+    with refused:  # the first step that is ever written begins an episode
+        make(2, 90, 3, padding="constant").extend(steps[:, before:])
+    buffer = make(None, 90, 3, padding="constant")
+    buffer.extend(steps[0, :before])
+    with refused:  # of another worker
+        buffer.extend(steps[1, before:])
+    assert len(buffer) == before
+
+
 def test_is_init_and_episode() -> None:
     steps = play_several(3, STEPS, 4, "same")
     buffer = make(3, 3 * STEPS, 4, is_init=True)

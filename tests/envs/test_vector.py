@@ -8,8 +8,10 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from tensordict import assert_close
+from torchrl.collectors import Collector
 from torchrl.data import Unbounded
 from torchrl.envs.utils import check_env_specs
+from torchrl.modules import RandomPolicy
 
 from tests.envs.reference import wrapped
 from torchrl_tit.envs import GymVectorEnv, make_env
@@ -140,6 +142,14 @@ def test_steps_that_were_taken_can_lack_their_histories():
         assert "history" in root
     assert lean.rollout(5, break_when_any_done=False).shape == (3, 5)
     check_env_specs(lean)
+
+
+def test_a_collector_stores_no_zeros_for_histories_that_steps_lack():
+    """With its default arguments, which allocate a buffer for all entries of the specs."""
+    env = make_env("CartPole-v1", 3, num_frames=4, keep_histories=False)
+    [batch] = Collector(env, RandomPolicy(env.action_spec), frames_per_batch=60, total_frames=60)
+    assert not {"history", ("next", "history")} & set(batch.keys(True))
+    assert batch["observation"].any()
 
 
 def test_what_spaces_draw_follows_from_the_seed():

@@ -115,6 +115,14 @@ class MeanHistory(HistorySettings, name="tests-mean", builds=f"{__name__}:MeanPa
     pass
 
 
+@dataclass(frozen=True, kw_only=True)
+class ForgottenHistory(HistorySettings, name="tests-forgotten", builds=settings.GRU.builds):
+    """Does not say that its encoder is recurrent."""
+
+    hidden_dim: int = 8
+    num_layers: int = 1
+
+
 def build(part, observation=(4,)):
     frame = part if isinstance(part, FrameSettings) else settings.Linear()
     history = part if isinstance(part, HistorySettings) else settings.Outer(num_blocks=1)
@@ -161,6 +169,7 @@ def test_settings_and_shape_are_enough(wrong):
         (OwnFrames(wrong="state"), (4,), "Own gives the same input another output at the"),
         (OwnFrames(wrong="batch"), (4,), "the output of Own for one entry of a batch depends"),
         (OwnHistory(wrong="batch"), (4,), "the output of OwnPast for one entry of a batch depends"),
+        (ForgottenHistory(), (4,), "whose is_recurrent is True: write `is_recurrent = True` in"),
         (OwnFrames(), (3, 8, 8), r"tests-own frames do not read an image of shape \(3, 8, 8\)"),
         (OwnFrames(), CATEGORIES, r"do not read a row of categories \(4 values\)"),
         (OtherFrames(), (4,), "builds a NoEncoder, which is no FrameEncoder: derive it from "

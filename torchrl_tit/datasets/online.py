@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.utils import expand_right
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
@@ -174,8 +175,9 @@ class OnlineHistoryStorage(LazyTensorStorage):
         Raises:
             RuntimeError: if items are to be changed, or written out of order.
             ValueError: if the steps do not cover all environments, have histories of another entry
-                than "observation", do not continue those before them though "is_init" is False, or
-                were made n-step ones by TorchRL's `MultiStepTransform`.
+                than "observation" or that reach back beyond the first step of an episode, do not
+                continue those before them though "is_init" is False, or were made n-step ones by
+                TorchRL's `MultiStepTransform`.
         """
         if not set_cursor:
             raise RuntimeError("Stored steps cannot be changed, only added.")
@@ -194,7 +196,7 @@ class OnlineHistoryStorage(LazyTensorStorage):
                 "so they give no histories. Store single steps, without MultiStepTransform, and "
                 "draw slices for n-step targets."
             )
-        steps = data.select(*_STORED).update(data.select(*_OPTIONAL, strict=False))
+        steps = data.select(*_STORED).update(data.select(*_OPTIONAL, "history", strict=False))
         steps = steps.to(self.device)
         steps = steps if self.ndim == 2 else steps.unsqueeze(-1)  # [T, envs]
         if not self.initialized:
@@ -234,6 +236,7 @@ class OnlineHistoryStorage(LazyTensorStorage):
                 )
             ended |= is_init
         goes_on &= ~ended
+        _check_starts(steps, ~goes_on, self._padding)
         if begin:  # only the new steps show whether these ended an episode
             self._end(last, newest, ~goes_on[0])
         time = torch.arange(begin, begin + count, device=self.device).unsqueeze(-1)
@@ -250,7 +253,8 @@ class OnlineHistoryStorage(LazyTensorStorage):
         self._frames[self._frame_rows(begin, begin + count + 1)] = torch.cat(
             [frames, following[-1:]]
         ).flatten()
-        self._write(begin, steps.exclude("observation", "is_init", ("next", "observation")), starts)
+        frames_of = ("observation", "history", ("next", "observation"))
+        self._write(begin, steps.exclude(*frames_of, "is_init"), starts)
 
     def _write(self, begin: int, steps: TensorDictBase, starts: Tensor) -> None:
         """Writes steps [T, envs] without frames into TorchRL's table, and where episodes began."""
@@ -473,12 +477,30 @@ class EndFrames:
         return self.table[torch.arange(first, self.stop) % len(self.table)]
 
 
-def _check_histories(steps: TensorDictBase) -> None:
-    """Raises ValueError if histories that will be made again [T, ...] are not of what is stored."""
+def _with_histories(steps: TensorDictBase) -> Iterator[tuple[NestedKey, Tensor, Tensor]]:
+    """Gives the key, frames [T, ..., *frame] and histories [T, ..., K, *frame] of observations."""
     for key, frames in steps.select("observation").items(True, True):
         history = steps.get(("history", *key[1:]) if isinstance(key, tuple) else "history", None)
-        if history is None:
-            continue
+        if history is not None:
+            yield key, frames, history
+
+
+def _check_starts(steps: TensorDictBase, begins: Tensor, padding: Padding) -> None:
+    """Raises ValueError if histories show steps before those that begin an episode, [T, envs]."""
+    for _, frames, history in _with_histories(steps):
+        first, older = frames[begins].unsqueeze(1), history[begins][:, :-1]
+        pad = first if padding == "same" else torch.zeros_like(first)
+        if differs(older, pad.expand_as(older), 1).any():
+            raise ValueError(
+                f"Histories of steps that begin an episode here do not have padding={padding!r}. "
+                "Give the storage History's padding, begin with a reset, let what acts at a reset "
+                "(NoopResetEnv) come before History, and give each worker a storage of its own."
+            )
+
+
+def _check_histories(steps: TensorDictBase) -> None:
+    """Raises ValueError if histories that will be made again [T, ...] are not of what is stored."""
+    for key, frames, history in _with_histories(steps):
         newest = history.select(steps.ndim, -1)
         if newest.shape != frames.shape or differs(newest, frames, steps.ndim).any():
             raise ValueError(

@@ -250,6 +250,15 @@ class TransformedVectorEnv(TransformedEnv):
         self.transient_keys = tuple(transient_keys)
         """Entries that are removed from a step after it is taken."""
 
+    @property
+    def _has_dynamic_specs(self) -> bool:
+        """Whether steps differ from the specs, so that no collector allocates buffers by them.
+
+        Entries that steps lack would stay zero in these buffers. TorchRL has no public setting for
+        this but ``use_buffers=False``, which each collector would need.
+        """
+        return bool(self.transient_keys) or super()._has_dynamic_specs
+
     def step_and_maybe_reset(
         self, tensordict: TensorDictBase
     ) -> tuple[TensorDictBase, TensorDictBase]:

@@ -190,8 +190,9 @@ class ActingCollector(Collector):
     """TorchRL's collector, with its policy in acting mode while it collects a batch.
 
     Between two batches, when the policy is trained and saved, no tokens are kept. New weights apply
-    to all frames: each batch starts with an empty cache, and weights that arrive during a batch, in
-    a ``MultiAsyncCollector`` for example, clear it.
+    to all frames: each batch starts with an empty cache, and :meth:`update_policy_weights_` clears
+    it during a batch. The worker of a ``MultiAsyncCollector`` shares its weights' memory, so a few
+    of its steps can read new weights with older tokens before it is told.
 
     The arguments are those of ``torchrl.collectors.Collector``. Collectors of several processes
     take it as their ``collector_class``.

@@ -96,6 +96,12 @@ def build_history(history: settings.HistorySettings, shape: HistoryShape) -> His
         ValueError: if it cannot read tokens of that shape, or does not output what it promises.
     """
     encoder = _build(history, HistoryEncoder, shape)
+    if encoder.is_recurrent != history.is_recurrent:
+        raise BrokenEncoderError(
+            f"history encoder {history.name} builds a {type(encoder).__name__}, whose is_recurrent "
+            f"is {encoder.is_recurrent}: write `is_recurrent = {encoder.is_recurrent}` in "
+            f"{type(history).__name__}, too"
+        )
     if _is_own(history) and not encoder.context and not history.is_recurrent:  # reads only tokens
         tokens = (shape.num_frames, shape.num_tokens, shape.width)
         _check_output(

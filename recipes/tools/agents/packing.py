@@ -17,6 +17,7 @@ from torchrl_tit.agents import AgentError
 from torchrl_tit.agents.folder import CARD, RECIPE, VERSIONS, WEIGHTS
 from torchrl_tit.agents.hub import import_hub
 from torchrl_tit.evaluation_file import EVALUATION
+from torchrl_tit.settings.imports import allowed_modules
 
 from ...core.numbers import measured_words, plus_minus
 from ...core.recipe import DatasetRecipe, Recipe
@@ -150,6 +151,10 @@ def _card(recipe: Recipe, evaluation: Mapping[str, Any], **facts: Any) -> str:
         data=f", on the data set `{evaluation['dataset']}`" if "dataset" in evaluation else "",
         recipe_name=f"`{recipe.name}`, " if recipe.name else "",
         results=_results(evaluation),
+        imports="".join(
+            f"import {PurePath(module).name.removesuffix('.py')}  # not in torchrl-tit\n"
+            for module in allowed_modules()
+        ),
         use=_PLAY if recipe.env else _ACT,
     )
 

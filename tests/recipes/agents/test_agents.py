@@ -1,6 +1,7 @@
 """From a run to an agent and back: every algorithm's policy acts as it did in the run."""
 
 import json
+import os
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +18,7 @@ from recipes.tools.agents import pack
 from tests.agents.runs import make_run, packed
 from torchrl_tit import load_agent
 from torchrl_tit.agents import AgentError, TrainedAgent
-from torchrl_tit.agents.folder import CONTENTS, RECIPE, WEIGHTS, write_agent
+from torchrl_tit.agents.folder import CARD, CONTENTS, RECIPE, WEIGHTS, write_agent
 from torchrl_tit.evaluation_file import EVALUATION
 from torchrl_tit.modules import acting
 from torchrl_tit.settings.networks import dt_tit, lstm, mlp
@@ -181,3 +182,11 @@ def test_names_on_cards(run):
         pack(run, "a: b")
     with pytest.raises(AgentError, match="license must be letters"):
         pack(run, "a", license="MIT License")
+
+
+def test_a_card_imports_the_modules_of_its_own_parts(run, monkeypatch):
+    """By their names alone: a path names a machine."""
+    monkeypatch.setenv("TORCHRL_TIT_IMPORTS", os.pathsep.join(["pack_a.parts", "/home/me/mine.py"]))
+    card = pack(run, "a")[0][CARD].decode()
+    assert "\nimport pack_a.parts  # not in torchrl-tit\nimport mine  # not in" in card
+    assert "/home" not in card

@@ -53,6 +53,7 @@ MISTAKES = [
     ("summary run --networks mlp --networks=d2rl", "--networks is there twice"),
     ("evaluate nowhere", "is not a run folder"),
     ("evaluate run --dataset a.hdf5 --episodes 3", "--episodes are those that are played"),
+    ("evaluate run --dataset a.hdf5 --seed 3", "--seed is for episodes or --ope"),
     (
         "evaluate run --dataset a.hdf5 --env Other-v0",
         "--env and --env-settings name what is played",
@@ -66,6 +67,7 @@ MISTAKES = [
     ("play run --seed -1", "--seed must be at least 0, not -1"),
     ("play run --out film.txt", "a film is one of .gif, .mp4"),
     ("share run", "share needs REPO, such as me/cartpole, or --out FOLDER"),
+    ("share run --out new --private", "--private is for REPO on the Hub"),
     ("share empty --out new", "holds no checkpoint: train the run first"),
     ("share nowhere --out new", "there is no agent or folder"),
     ("share run --out run/recipe.json/new", "File exists: 'run/recipe.json'"),

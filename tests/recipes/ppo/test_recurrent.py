@@ -50,7 +50,6 @@ def collected(request):
         frames_per_batch=400,
         total_frames=400,
         auto_register_policy_transforms=False,
-        use_buffers=False,
     )
     with torch.no_grad():
         batch = next(iter(collector))

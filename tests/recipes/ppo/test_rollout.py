@@ -84,7 +84,6 @@ def test_windows_are_those_that_the_policy_read(envs, frames, padding):
         frames_per_batch=13 * envs,
         total_frames=78 * envs,
         auto_register_policy_transforms=False,
-        use_buffers=False,
     )
     ended = 0
     for batch in collector:
