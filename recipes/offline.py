@@ -287,6 +287,9 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
     def measure(self, step: int, episodes: Episodes | None = None) -> HeldOut | None:
         """Measures the current weights, without dropout and with the most likely actions.
 
+        Each step counts once; of steps in slices, those that the last slice shares with the one
+        before count twice.
+
         Args:
             step: number of steps done so far.
             episodes: the episodes to measure them on; those that are held out if None.
@@ -311,7 +314,6 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
                 f"of {length}: use longer episodes"
             )
         size = getattr(recipe, "slice_length", 1)
-        # Steps count once, but for those that the last slice shares with the one before.
         stride = max(size, math.ceil(count * size / _MOST_MEASURED))
         starts = torch.arange(0, count + stride - 1, stride).clamp(max=count - 1)
         index = starts.unsqueeze(-1) + torch.arange(length) if length > 1 else starts

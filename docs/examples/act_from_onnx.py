@@ -23,20 +23,22 @@ class Agent:
     def reset(self, which=None):
         """Begins an episode with the next observation: in all copies, or where bool [N] says so."""
         if which is None:
-            self.first, self.state, self.last = True, {}, None
-        elif np.asarray(which).dtype == bool:
-            self.first = np.logical_or(self.first, which)
-        else:
+            self.first, self.state, self.last, self.given = True, {}, None, None
+            return
+        which = np.asarray(which)
+        if which.dtype != bool or (self.last is not None and which.size != len(self.last)):
             raise ValueError(f"which must be bool, one for each copy, not {which}")
+        self.first = np.logical_or(self.first, which)
 
     def act(self, observation, *, reward=0.0, action_mask=True):
         """Maps an observation, or those of N copies, [N, ...], to actions; holds values for NaN."""
         shape = tuple(self.facts["inputs"]["observation"]["shape"])
-        frames = np.atleast_1d(np.full(shape, np.nan) if observation is None else observation)
+        unknown = np.full(self.given or shape, np.nan)
+        frames = np.atleast_1d(unknown if observation is None else observation)
         several = frames.ndim > len(shape)
         if frames.shape[several:] != shape:
             raise ValueError(f"expected observations {shape} or N of them, not {frames.shape}")
-        frames = frames.reshape(-1, *shape)
+        as_given, frames = frames.shape, frames.reshape(-1, *shape)
         if self.last is not None and len(frames) != len(self.last):
             raise ValueError(f"{len(frames)} copies act, not {len(self.last)}: call reset() first")
         if (missing := np.isnan(frames)).any():
@@ -51,7 +53,7 @@ class Agent:
             raise ValueError(f"expected observations of {kind}; images range from 0 to 255")
         if np.isinf(converted).any():
             raise ValueError(f"the observation is infinite in {kind}")
-        self.last = frames
+        self.last, self.given = frames, as_given
         given = {"observation": frames, "is_init": self.first, "reward": reward, **self.state}
         given |= {"action_mask": action_mask, "target_return": self.facts.get("target_return")}
         inputs = {}

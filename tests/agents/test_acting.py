@@ -263,6 +263,12 @@ def test_a_file_acts_as_its_agent(made, tmp_path, name):
             found = exported.act(frames, reward=1.0)
             assert found.dtype == expected.dtype
             np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+        expected, found = agent.act(None, reward=1.0), exported.act(None, reward=1.0)
+        assert found.shape == expected.shape
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+        for reset in (agent.reset, exported.reset):
+            with pytest.raises(ValueError, match="which must be"):
+                reset([True, False])
     [size] = env.observation_space.shape
     for frames in (np.zeros(2 * size), np.zeros((3, 2 * size)), np.zeros((2, 3, size))):
         with pytest.raises(ValueError, match="expected observations"):

@@ -11,7 +11,7 @@ import minari
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete
 from minari.data_collector import EpisodeBuffer
 
 from tests.datasets.rollouts import Transitions, spans, write
@@ -325,6 +325,18 @@ def test_damaged_sets(rolled: Transitions, folder: Path) -> None:
     metadata.write_text("{")
     with pytest.raises(DatasetError, match="is not a whole Minari data set"):
         load_episodes(NAME)
+
+
+@pytest.mark.parametrize("space", [MultiBinary(3), MultiDiscrete([2, 2, 2])])
+def test_observations_of_several_categories(space: Any) -> None:
+    seen = np.array([[0, 1, 1], [1, 0, 0], [1, 1, 0]], space.dtype)
+    steps = {"actions": np.zeros((2, 1)), "rewards": [0.0, 1.0]}
+    steps |= {"terminations": [False, True], "truncations": [False, False]}
+    make({"observations": seen, **steps}, observation_space=space, action_space=Box(-1, 1, (1,)))
+    episodes = load_episodes(NAME, max_episode_steps=2)
+    assert episodes.rows["observation"].tolist() == seen.tolist()
+    with pytest.raises(DatasetError, match="an episode of 2 steps, but max_episode_steps is 1"):
+        load_episodes(NAME, max_episode_steps=1)
 
 
 def test_observations_of_several_arrays_are_refused() -> None:

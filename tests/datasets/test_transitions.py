@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
 from tests.datasets.hostile import nest
 from tests.datasets.rollouts import NAMES, Transitions, roll, spans, write
@@ -142,6 +142,12 @@ def test_without_timeouts(arrays: Transitions) -> None:
     del arrays["next_observations"]
     data = fields_of(episodes_from_arrays(**arrays, max_episode_steps=15))
     np.testing.assert_array_equal(data["timeouts"], timeouts & ~arrays["terminals"])
+    marked = {**arrays, "timeouts": timeouts}
+    np.testing.assert_array_equal(
+        fields_of(episodes_from_arrays(**marked, max_episode_steps=15))["timeouts"], timeouts
+    )
+    with pytest.raises(DatasetError, match=r"an episode of 15 steps, but max_episode_steps is 14"):
+        episodes_from_arrays(**marked, max_episode_steps=14)
     arrays["terminals"][:] = False
     with pytest.raises(DatasetError, match=r"no episode ends.*give max_episode_steps"):
         episodes_from_arrays(**arrays)
@@ -392,6 +398,22 @@ def test_bounds_are_those_of_the_entry_that_is_wrong() -> None:
         check_actions("a.hdf5", np.array([[-0.5, 0.5], [0.5, -0.5]]), space, first_row=5)
     with pytest.raises(DatasetError, match="row 1: is 3, but the task's actions range from 0 to 2"):
         check_actions("a.hdf5", np.array([[2], [3]]), Discrete(3))
+
+
+@pytest.mark.parametrize(
+    ("space", "actions", "message"),
+    [
+        (MultiBinary(2), [[0, 1], [2, 1]], "row 1: is 2, .* from 0 to 1 here"),
+        (MultiBinary((1, 2)), [[[0, 1]], [[-1, 1]]], "row 1: is -1, .* from 0 to 1 here"),
+        (MultiDiscrete([2, 3]), [[1, 2], [2, 0]], "row 1: is 2, .* from 0 to 1 here"),
+        (MultiDiscrete([2, 3], start=[0, 4]), [[1, 6], [0, 3]], "row 1: is 3, .* from 4 to 6 here"),
+    ],
+)
+def test_each_of_several_choices_lies_in_its_range(space: Any, actions: Any, message: str) -> None:
+    """A switch that is 2 would have any likelihood."""
+    check_actions("a.hdf5", np.array(actions[:1]), space)
+    with pytest.raises(DatasetError, match=message):
+        check_actions("a.hdf5", np.array(actions), space)
 
 
 def test_selected_and_joined_episodes_keep_their_rows(arrays: Transitions) -> None:

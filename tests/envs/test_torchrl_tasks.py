@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from tensordict import assert_close
 from tensordict.nn import TensorDictModule
 from torchrl.data import (
     Binary,
@@ -15,7 +16,7 @@ from torchrl.data import (
     OneHot,
     Unbounded,
 )
-from torchrl.envs import EnvBase, GymEnv
+from torchrl.envs import EnvBase, GymEnv, RenameTransform, TransformedEnv
 
 from tests.envs.tasks import Corridor
 from tests.envs.test_spaces import kinds
@@ -50,6 +51,11 @@ def two_hands() -> EnvBase:
     env = Corridor()
     env.full_action_spec = Composite(left=Categorical(2), right=Categorical(2))
     return env
+
+
+def nested() -> EnvBase:
+    renaming = RenameTransform([], [], ["action"], [("agents", "action")])
+    return TransformedEnv(Corridor(), renaming)
 
 
 def actions(env: EnvBase, steps: int) -> list[torch.Tensor]:
@@ -260,6 +266,17 @@ def test_kinds_of_actions(found, ours, action, expected):
     converted = convert(torch.as_tensor(action, dtype=spec.dtype))
     assert converted.tolist() == expected
     assert found.is_in(converted)
+
+
+def test_the_one_action_may_have_a_nested_key():
+    played = []
+    for name in ("nested", "Corridor"):
+        module = __name__ if name == "nested" else Corridor.__module__
+        env = make_env(f"{module}:{name}", 2, seed=0)
+        assert isinstance(env.action_spec, Categorical)
+        torch.manual_seed(0)
+        played.append(env.rollout(9, break_when_any_done=False))
+    assert_close(*played)
 
 
 def test_text_is_left_out():

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from gymnasium import Space
 from gymnasium.envs.registration import parse_env_id
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 from numpy.typing import NDArray
 from torch import Tensor
 from torchrl.data import Unbounded
@@ -261,7 +261,8 @@ def check_actions(source: str, values: NDArray, space: Space, first_row: int = 0
     Args:
         source: where the data came from, for error messages.
         values: some rows of the actions.
-        space: a `Box` or `Discrete` action space; others are not checked.
+        space: a `Box`, `Discrete`, `MultiDiscrete` or `MultiBinary` action space; others are not
+            checked.
         first_row: index of the first of these rows.
 
     Raises:
@@ -275,9 +276,12 @@ def check_actions(source: str, values: NDArray, space: Space, first_row: int = 0
     """
     if isinstance(space, Box):
         low, high, tolerance = space.low, space.high, _ACTION_TOLERANCE
-    elif isinstance(space, Discrete):
-        low, high = np.array(space.start), np.array(space.start + space.n - 1)
-        tolerance = 0.0
+    elif isinstance(space, Discrete | MultiDiscrete):
+        count = space.n if isinstance(space, Discrete) else space.nvec
+        low, tolerance = np.asarray(space.start), 0.0
+        high = low + count - 1
+    elif isinstance(space, MultiBinary):
+        low, high, tolerance = np.array(0), np.array(1), 0.0
     else:
         return
     wrong = (values < low - tolerance) | (values > high + tolerance)
@@ -285,6 +289,31 @@ def check_actions(source: str, values: NDArray, space: Space, first_row: int = 0
         row, value, lowest, highest = _first(wrong, *np.broadcast_arrays(values, low, high))
         problem = f"is {value}, but the task's actions range from {lowest} to {highest} here."
         raise DatasetError(source, problem, "actions", first_row + row)
+
+
+def check_limit(source: str, lengths: NDArray, max_episode_steps: int | None) -> None:
+    """Checks that no episode is longer than a time limit.
+
+    Args:
+        source: where the data came from, for error messages.
+        lengths: number of steps of each episode, int64 [E].
+        max_episode_steps: the limit, if there is one.
+
+    Raises:
+        DatasetError: if one is: the limit ends episodes only in data that do not mark their ends.
+
+    Example:
+        >>> check_limit("a.hdf5", np.array([9, 25]), max_episode_steps=10)
+        Traceback (most recent call last):
+        ...
+        torchrl_tit.datasets.checks.DatasetError: a.hdf5: has an episode of 25 steps, but...
+    """
+    if max_episode_steps is not None and (longest := int(lengths.max())) > max_episode_steps:
+        raise DatasetError(
+            source,
+            f"has an episode of {longest} steps, but max_episode_steps is {max_episode_steps}: "
+            "leave it out, or remove 'timeouts' that do not mark all ends.",
+        )
 
 
 def _first(wrong: NDArray, *arrays: NDArray) -> tuple:

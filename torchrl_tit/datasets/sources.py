@@ -15,7 +15,13 @@ import msgspec
 import torch
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
-from torchrl_tit.datasets.checks import DatasetError, TaskSpaces, check_task_name, task_spaces
+from torchrl_tit.datasets.checks import (
+    DatasetError,
+    TaskSpaces,
+    check_limit,
+    check_task_name,
+    task_spaces,
+)
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.hdf5 import read_hdf5
 from torchrl_tit.datasets.hdf5_files import damage_named, h5py
@@ -48,8 +54,9 @@ def load_episodes(
             "mujoco/hopper/medium-v0". Named data sets are downloaded once.
         task: the task that the data must match in shapes, action bounds and (if recorded) name: a
             name registered with Gymnasium, such as "Hopper-v5", or the spaces. Not checked if None.
-        max_episode_steps: the time limit of an HDF5 file without "timeouts": see
-            :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`.
+        max_episode_steps: the time limit of an HDF5 file without "timeouts", see
+            :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`. No episode of
+            other data may be longer.
         gaps: what to do at gaps in an HDF5 file's "next_observations" or "timestamps": see the same
             function.
         dtype: the dtype for floats; None keeps that of each field. Integers stay integers.
@@ -89,7 +96,9 @@ def load_episodes(
     if path.is_dir() or is_minari_name(name):
         if not path.is_dir() and "/" not in name:
             _check_spelling(name)
-        return read_minari(source, **reading)
+        episodes = read_minari(source, **reading)
+        check_limit(name, episodes.lengths.numpy(), max_episode_steps)
+        return episodes
     if path.is_absolute() or name.startswith("."):
         raise FileNotFoundError(f"There is no data set {name}.")
     raise ValueError(

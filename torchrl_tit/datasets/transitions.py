@@ -20,6 +20,7 @@ from torchrl_tit.datasets.checks import (
     check_actions,
     check_bytes,
     check_finite,
+    check_limit,
     check_shape,
     check_task_name,
     kept_dtype,
@@ -112,7 +113,7 @@ def episodes_from_transitions(
             See :func:`episodes_from_arrays` for their shapes.
         source: name of the source, for error messages.
         task: the task whose shapes and action bounds the data must have; not checked if None.
-        max_episode_steps: the time limit of data without ``timeouts``.
+        max_episode_steps: the time limit of data without ``timeouts``; no episode may be longer.
         gaps: what to do where, within an episode, ``next_observations`` is not the observation of
             the next row, or ``timestamps`` are more than one and a half times their median interval
             apart: ``"error"`` raises, ``"cut"`` truncates the episode there.
@@ -131,8 +132,9 @@ def episodes_from_transitions(
         ValueError: if ``max_episode_steps`` is less than 1, ``gaps`` is not one of the above, or
             ``dtype`` is not a floating-point dtype.
         DatasetError: if a field is missing or empty, has the wrong length, shape or dtype, or
-            contains NaN, infinity, or actions out of bounds; if no episode ends; or if, within an
-            episode, there are gaps or ``timestamps`` go backwards.
+            contains NaN, infinity, or actions out of bounds; if no episode ends, or one is longer
+            than ``max_episode_steps``; or if, within an episode, there are gaps or ``timestamps``
+            go backwards.
 
     Example:
         >>> fields = {"observations": np.zeros((2, 3)), "rewards": np.zeros(2)}
@@ -173,6 +175,8 @@ def episodes_from_transitions(
     if times is not None:
         _check_times(source, times, ends)
     last_steps = np.flatnonzero(ends)
+    steps = np.diff(last_steps, prepend=-1)
+    check_limit(source, steps, max_episode_steps)
     cut = cuts[last_steps] | np.append(False, cuts[last_steps[:-1]])
     if CUTS in fields:
         cut |= reader.flags(CUTS)[last_steps]
@@ -194,7 +198,7 @@ def episodes_from_transitions(
         _place_next_observations(reader, rows["observation"], row_of, torch.from_numpy(ends))
     return Episodes(
         rows=rows,
-        lengths=torch.from_numpy(np.diff(last_steps, prepend=-1)),
+        lengths=torch.from_numpy(steps),
         final_known=torch.full((len(last_steps),), has_next),
         cut=torch.from_numpy(cut),
         source=source,

@@ -65,7 +65,7 @@ class TorchRLTask(EnvBase):
             image_layout=image_layout,
             mask_actions=mask_actions,
         )
-        spec, write = action_spec(env.action_spec, clip=clip_actions)
+        spec, write = action_spec(env.full_action_spec[env.action_key], clip=clip_actions)
         super().__init__(device=env.device, batch_size=torch.Size([]))
         self._env, self._read = env, read
         self.action_writer = write
