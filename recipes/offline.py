@@ -287,9 +287,6 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
     def measure(self, step: int, episodes: Episodes | None = None) -> HeldOut | None:
         """Measures the current weights, without dropout and with the most likely actions.
 
-        Each step counts once; of steps in slices, those that the last slice shares with the one
-        before count twice.
-
         Args:
             step: number of steps done so far.
             episodes: the episodes to measure them on; those that are held out if None.
@@ -315,8 +312,12 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
             )
         size = getattr(recipe, "slice_length", 1)
         stride = max(size, math.ceil(count * size / _MOST_MEASURED))
-        starts = torch.arange(0, count + stride - 1, stride).clamp(max=count - 1)
+        starts = torch.arange(0, count, stride)
         index = starts.unsqueeze(-1) + torch.arange(length) if length > 1 else starts
+        parts = [*index.split(max(1, _MEASURED_AT_ONCE // length))]
+        after = int(starts[-1]) + stride
+        if len(items) - after > length - size:  # the steps that remain are a shorter slice
+            parts.append(torch.arange(after, len(items)).unsqueeze(0))
         sums, total = dict.fromkeys(self.measures, 0.0), 0
         with (
             ExitStack() as modes,
@@ -329,10 +330,12 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
                 if isinstance(part, nn.Module):
                     modes.enter_context(evaluating(part))
             torch.manual_seed(recipe.evaluation_seed)
-            for part in index.to(items.device).split(max(1, _MEASURED_AT_ONCE // length)):
-                samples = to_networks(arrange(items.get(part)), self.device)
+            for part in parts:
+                samples = to_networks(arrange(items.get(part.to(items.device))), self.device)
                 means, mask = self.measure_batch(samples), samples.get("mask", None)
-                count = len(part) if mask is None else int(mask.sum())  # padding does not count
+                # Padding and the steps before a slice do not count.
+                count = part.numel() - len(part) * (length - size)
+                count = count if mask is None else int(mask.sum())
                 total += count
                 for name in sums:
                     sums[name] += means[name].item() * count

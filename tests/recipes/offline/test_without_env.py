@@ -161,7 +161,7 @@ def test_no_more_items_are_measured_than_the_limit(tmp_path, monkeypatch):
     assert sum(counts) == 86  # every second of 9 * 19
 
 
-def test_slices_of_held_out_episodes_hardly_overlap(tmp_path, monkeypatch):
+def test_each_step_of_held_out_slices_counts_once(tmp_path, monkeypatch):
     data = str(log_machine(tmp_path / "log.hdf5"))
     recipe = BC(dataset=data, backbone=gru(hidden_dim=8), slice_length=8)
     algorithm = make_algorithm(recipe)
@@ -169,14 +169,28 @@ def test_slices_of_held_out_episodes_hardly_overlap(tmp_path, monkeypatch):
     rows, measure_batch = [], algorithm.measure_batch
 
     def seen(samples):
-        rows.append(samples["action"])
+        rows.append(samples["action"].flatten(0, 1))
         return measure_batch(samples)
 
     monkeypatch.setattr(algorithm, "measure_batch", seen)
     algorithm.measure(0, read_data(algorithm.recipe))
-    measured = torch.cat(rows).flatten(0, 1)
-    assert len(items) <= len(measured) < len(items) + 8
-    assert all((measured == row).all(-1).any() for row in items[:]["action"])
+    assert len(items) % 8
+    assert torch.equal(torch.cat(rows), items[:]["action"])
+
+
+@pytest.mark.parametrize(("kind", "slice_length"), [(TD3BC, 8), (IQL, 7)])
+def test_slices_are_measured_as_single_steps_are(tmp_path, kind, slice_length):
+    data = str(log_machine(tmp_path / "log.hdf5"))
+    found = []
+    for length in (1, slice_length):
+        settings = {"slice_length": length, "batch_size": 2 * slice_length, "seed": 3}
+        recipe = kind(dataset=data, backbone=tit(3), critic_hidden=(8,), **settings)
+        torch.manual_seed(0)
+        algorithm = make_algorithm(recipe)
+        episodes = read_data(algorithm.recipe)
+        assert len(algorithm.measured_items(episodes)) % slice_length
+        found.append(algorithm.measure(0, episodes).values)
+    assert found[0] == pytest.approx(found[1], rel=1e-4)
 
 
 def test_every_step_of_windows_counts_the_same(tmp_path, monkeypatch):
