@@ -31,7 +31,7 @@ from torchrl_tit.settings.numbers import (
 
 from .core.algorithm import Terms, descend
 from .core.compilation import check_compiler, compile_and_time, should_compile
-from .core.networks import check_actions, is_discrete, make_value_policy
+from .core.networks import check_actions, entropy_to_aim_for, is_discrete, make_value_policy
 from .core.recipe import Compile
 from .offline import TransitionAlgorithm, TransitionRecipe
 
@@ -167,12 +167,13 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
         self._policy = ProbabilisticTensorDictSequential(backbone, *head).to(self.device)
         loss = ContinuousCQLLoss(
             self._policy,
-            [self.make_critic(env, spec.shape[0]) for _ in range(2)],
+            [self.make_critic(env, spec) for _ in range(2)],
             action_spec=spec,
             min_q_weight=recipe.conservative_weight,
             num_random=recipe.action_samples,
             over_critics=recipe.over_critics,
             alpha_init=recipe.alpha_init,
+            target_entropy=entropy_to_aim_for(spec),
         )
         loss.make_value_estimator(gamma=recipe.gamma)
         return loss

@@ -78,9 +78,9 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
         self._policy = make_cloning_policy(backbone, spec).to(self.device)
         # A critic values one action, or each discrete one.
         discrete = is_discrete(spec)
-        size, values = (0, spec.space.n) if discrete else (spec.shape[0], 1)
-        critics = [self.make_critic(env, size, values=values) for _ in range(2)]
-        value = self.make_critic(env, 0, out_key="state_value")
+        action, values = (None, spec.space.n) if discrete else (spec, 1)
+        critics = [self.make_critic(env, action, values=values) for _ in range(2)]
+        value = self.make_critic(env, None, out_key="state_value")
         discrete_only = {"action_space": "categorical"} if discrete else {}
         make_loss = DiscreteIQLLoss if discrete else IQLLoss
         loss = make_loss(

@@ -17,8 +17,8 @@ from torchrl_tit.modules.action_specs import has_bounds
 from torchrl_tit.settings.numbers import Rate, Steps, Weight
 
 from .core.algorithm import Stateful, Terms, descend
-from .core.networks import check_actions, make_deterministic_policy
-from .offline import ActorCriticRecipe, TransitionAlgorithm
+from .core.networks import check_actions, half_range, make_deterministic_policy
+from .offline import ActorCriticRecipe, TransitionAlgorithm, action_values
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,15 +69,15 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
         # TorchRL's loss hides keys from the critics that the actor does not declare: "observation".
         backbone = self.make_backbone(env, slices=True)
         self._policy = make_deterministic_policy(backbone, spec).to(self.device)
-        half_range = (spec.space.high - spec.space.low) / 2
+        self.half_range = half_range(spec).to(self.device)
         loss = TD3BCLoss(
             self._policy,
-            [self.make_critic(env, spec.shape[0]) for _ in range(2)],
+            [self.make_critic(env, spec) for _ in range(2)],
             action_spec=spec,
             loss_function="l2",
             alpha=recipe.alpha,
-            policy_noise=recipe.policy_noise * half_range,
-            noise_clip=recipe.noise_clip * half_range,
+            policy_noise=recipe.policy_noise * self.half_range,
+            noise_clip=recipe.noise_clip * self.half_range,
             deactivate_vmap=recipe.slice_length > 1,  # which it cannot map over
         )
         loss.make_value_estimator(gamma=recipe.gamma)
@@ -99,9 +99,21 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
         return {"loss_qvalue": self.model.qvalue_loss(samples)[0]}
 
     def actor_loss(self, samples: TensorDictBase) -> Terms:
-        """Returns the terms of the actor, once the critics have taken a step on theirs."""
-        loss_actor, others = self.model.actor_loss(samples)
-        return {"loss_actor": loss_actor, "bc_loss": others["bc_loss"]}
+        """Returns the terms of the actor, once the critics have taken a step on theirs.
+
+        The behavior cloning term counts actions in half ranges, as the noise does. TorchRL's counts
+        them in units of the task, whose choice then decides how much the value matters.
+        """
+        loss = self.model
+        policy, critic = loss.actor_network, loss.qvalue_network
+        with loss.actor_network_params.to_module(policy, preserve_module_state=False):
+            chosen = policy(samples.select(*policy.in_keys, strict=False))["action"]
+        first, *_ = loss.qvalue_network_params.data.unbind(0)
+        with first.to_module(critic, preserve_module_state=False):
+            values = action_values(critic, samples, chosen)
+        bc_loss = ((chosen - samples["action"]) / self.half_range).square().mean()
+        weight = self.recipe.alpha / values.abs().mean().detach()
+        return {"loss_actor": bc_loss - weight * values.mean(), "bc_loss": bc_loss.detach()}
 
     def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor]:
         """Updates the critics, and every ``policy_delay`` steps the actor and the targets.

@@ -122,9 +122,10 @@ def make_cloning_policy(
     """Builds a policy that gives every action in a data set a finite likelihood.
 
     Bounded actions have a Gaussian whose mean is kept within the bounds by a tanh, and whose
-    standard deviation does not depend on the state (Kostrikov et al., arXiv 2110.06169, and its
-    authors' code). A squashed Gaussian's density is 0 at the bounds, where data sets have many
-    actions. Other actions use the head of :func:`~torchrl_tit.modules.make_actor`.
+    standard deviation does not depend on the state, and begins at half the range (Kostrikov et al.,
+    arXiv 2110.06169, and its authors' code). A squashed Gaussian's density is 0 at the bounds,
+    where data sets have many actions. Other actions use the head of
+    :func:`~torchrl_tit.modules.make_actor`.
 
     Args:
         backbone: the backbone.
@@ -138,7 +139,7 @@ def make_cloning_policy(
             backbone, *make_actor(backbone.features_dim, action_spec)
         )
     mean = _bounded(backbone, action_spec, "loc")
-    scale = AddStateIndependentNormalScale(action_spec.shape[0], scale_lb=math.exp(_MIN_LOG_STD))
+    scale = ScaleInUnits(action_spec)
     return ProbabilisticActor(
         TensorDictSequential(*mean, TensorModule(scale, ["loc"], ["loc", "scale"])),
         in_keys=["loc", "scale"],
@@ -175,7 +176,7 @@ def make_value_policy(
 
 def make_critic(
     observation: Observations,
-    action_dim: int,
+    action: TensorSpec | None,
     hidden: Sequence[int],
     network: Network | None = None,
     *,
@@ -188,7 +189,8 @@ def make_critic(
 
     Args:
         observation: spec of the observation, or of each by name.
-        action_dim: number A of entries of an action; 0 if it is not read.
+        action: spec of an action [A], which the MLP reads in units of its bounds, from -1 to 1, if
+            it has any; None if it is not read.
         hidden: widths of the MLP's hidden layers.
         network: settings of the backbone; if None, the MLP reads the newest observation.
         values: number of values, such as one for each discrete action.
@@ -219,14 +221,15 @@ def make_critic(
             modules, key = [TensorModule(flat, [key], ["normalized"])], "normalized"
         elif array.dtype == torch.uint8:  # as frame encoders read bytes
             modules, key = [TensorModule(bytes_to_floats, [key], ["floats"])], "floats"
-    mlp = MLP(
-        size + action_dim,
+    in_units = action is not None and has_bounds(action) and not _are_units(action)
+    mlp = (partial(ActionMLP, action) if in_units else MLP)(
+        size + (0 if action is None else action.shape[0]),
         values,
         num_cells=list(hidden),
         activation_class=nn.ReLU,
         activation_kwargs={"inplace": True},
     )
-    in_keys = [key, "action"] if action_dim else [key]
+    in_keys = [key] if action is None else [key, "action"]
     return TensorDictSequential(*modules, TensorValue(mlp, in_keys=in_keys, out_keys=[out_key]))
 
 
@@ -272,6 +275,54 @@ def check_actions(recipe: Recipe, spec: TensorSpec, fit: bool, needed: str, inst
             f"{recipe.algorithm} needs {needed}, but those of {recipe.task_name} are "
             f"{describe(spec)}: use {instead}"
         )
+
+
+def half_range(bounds: Bounded) -> Tensor:
+    """Half the range of each entry of an action, float [A]."""
+    return (bounds.space.high - bounds.space.low) / 2
+
+
+def entropy_to_aim_for(bounds: Bounded) -> float:
+    """Minus the number of entries, as in SAC (arXiv 1812.05905), for actions in their units."""
+    return half_range(bounds).log().sum().item() - bounds.shape[0]
+
+
+def _are_units(bounds: Bounded) -> bool:
+    return bool((bounds.space.low == -1).all() and (bounds.space.high == 1).all())
+
+
+class ScaleInUnits(AddStateIndependentNormalScale):
+    """Standard deviations [A], which begin at half the range of each entry."""
+
+    def __init__(self, bounds: Bounded) -> None:
+        super().__init__(bounds.shape[0], scale_lb=math.exp(_MIN_LOG_STD))
+        units = _are_units(bounds)  # whose checkpoints need no buffer
+        self.register_buffer("half_range", None if units else half_range(bounds))
+
+    def forward(self, loc: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
+        """Writes the deviations beside the means, float [..., A] each."""
+        loc, scale, *others = super().forward(loc, *others)
+        return loc, scale if self.half_range is None else scale * self.half_range, *others
+
+
+class ActionMLP(MLP):
+    """An MLP that reads actions [..., A] in units of their bounds, from -1 to 1.
+
+    Its weights have the names of those of an MLP, so critics can start from those of other units.
+    """
+
+    middle: Tensor
+    half_range: Tensor
+
+    def __init__(self, bounds: Bounded, *sizes: int, **layers: Any) -> None:
+        super().__init__(*sizes, **layers)
+        self.register_buffer("middle", (bounds.space.high + bounds.space.low) / 2)
+        self.register_buffer("half_range", half_range(bounds))
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Maps features [..., F] and actions to values, float [..., values]."""
+        features, action = inputs
+        return super().forward(features, (action - self.middle) / self.half_range)
 
 
 def _bounded(backbone: Backbone, action_spec: Bounded, key: str) -> list[nn.Module]:
@@ -374,12 +425,14 @@ class LearnsFromSamples(ABC):
             recipe.backbone, observation, slices=slices, normalization=self.normalization
         )
 
-    def make_critic(self, env: EnvBase, action_dim: int, **settings: Any) -> TensorDictModuleBase:
+    def make_critic(
+        self, env: EnvBase, action: TensorSpec | None, **settings: Any
+    ) -> TensorDictModuleBase:
         """Builds a value network on the networks' device; see :func:`make_critic`."""
         recipe = self.recipe
         return make_critic(
             observation_specs(env),
-            action_dim,
+            action,
             recipe.critic_hidden,
             recipe.critic_backbone,
             slices=recipe.slice_length > 1,

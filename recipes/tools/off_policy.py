@@ -300,7 +300,7 @@ def _make_critic(algorithm: TransitionAlgorithm[Any], episodes: Episodes) -> Ten
     small = mlp(recipe.backbone.num_frames, hidden_dim=256, activation="relu")
     critic = make_critic(
         observation,
-        0 if is_discrete(spec) else spec.shape[0],
+        None if is_discrete(spec) else spec,
         (256,),
         small if observation.ndim == 1 else recipe.backbone,
         values=spec.space.n if is_discrete(spec) else 1,

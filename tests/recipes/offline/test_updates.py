@@ -11,13 +11,14 @@ import pytest
 import torch
 from tensordict.nn import set_skip_existing
 from torch.nn import functional as F
-from torchrl.modules import MLP
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import BCLoss
 
 from recipes.bc import BCAlgorithm
+from recipes.core.networks import ActionMLP
 from recipes.cql import CQL, DiscreteCQL
 from recipes.dqn import DQN
-from recipes.offline import read_data
+from recipes.offline import read_data, with_spaces
 from recipes.sac import SAC
 from tests.datasets.rollouts import roll, write
 from tests.recipes.offline.test_without_env import log_machine
@@ -280,11 +281,11 @@ def test_critics_start_as_they_were_built(tmp_path, kind, monkeypatch):
     built = []
 
     def make_mlp(*sizes, **layers):
-        network = MLP(*sizes, **layers)
+        network = ActionMLP(*sizes, **layers)  # Pendulum's bounds are -2 and 2
         built.append({name: weight.clone() for name, weight in network.state_dict().items()})
         return network
 
-    monkeypatch.setattr("recipes.core.networks.MLP", make_mlp)
+    monkeypatch.setattr("recipes.core.networks.ActionMLP", make_mlp)
     settings: dict[str, Any] = {"env": "Pendulum-v1", "backbone": SMALL, "critic_hidden": (16,)}
     recipe = SAC(**settings) if kind is SAC else make(kind, tmp_path, **settings)
     loss = make_algorithm(recipe).model
@@ -413,7 +414,37 @@ def test_critics_read_bytes_as_the_policy_does(tmp_path, kind):
     batch = algorithm.buffer.sample()
     terms = algorithm.update(batch, 0)
     assert all(torch.as_tensor(value).isfinite().all() for value in terms.values())
-    critic, floats = algorithm.make_critic(algorithm.make_env(1), 2), batch.clone()
+    critic = algorithm.make_critic(algorithm.make_env(1), algorithm.action_spec)
+    floats = batch.clone()
     floats["observation"] = batch["observation"] / 255
     values = critic(batch)["state_action_value"]
     assert torch.equal(values, critic(floats)["state_action_value"])
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings"),
+    [
+        (BC, {}),
+        (IQL, {"critic_hidden": (8,)}),
+        (TD3BC, {"critic_hidden": (8,)}),
+        (CQL, {"critic_hidden": (8,), "cloning_updates": 3, "compile": "off"}),
+    ],
+)
+def test_policies_do_not_depend_on_the_units_of_the_actions(tmp_path, kind, settings):
+    """Of two entries with other units and other middles."""
+    draw = np.random.default_rng(0)
+    actions = draw.uniform(-1, 1, (60, 2))
+    actions[:2] = [[-1, 1], [1, -1]]
+    found = []
+    for unit, middle in (((1.0, 1.0), (0.0, 0.0)), ((0.03125, 64.0), (3.0, -16.0))):
+        logged = actions.astype(np.float32) * unit + np.array(middle)
+        data = log_machine(tmp_path / f"{middle}.hdf5", 60, actions=logged)
+        recipe = kind(dataset=str(data), backbone=SMALL, batch_size=16, **settings)
+        algorithm, batch = double(with_spaces(recipe), tmp_path)
+        torch.manual_seed(1)
+        for step in range(6):
+            algorithm.update(batch.clone(), step)
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            chosen = algorithm.policy(batch.clone())["action"]
+        found.append((chosen - torch.tensor(middle)) / torch.tensor(unit))
+    torch.testing.assert_close(*found, rtol=1e-5, atol=1e-6)

@@ -1,5 +1,6 @@
 """SAC: its gradient steps, its networks, and runs that are stopped and resumed."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -128,7 +129,7 @@ def test_the_loss_of_terminal_transitions(tmp_path: Path) -> None:
     batch["next", "terminated"][:] = True
     batch["next", "done"][:] = True
     critics = algorithm.model.qvalue_network_params["module", "0", "module"]
-    x = torch.cat([batch["observation"], batch["action"]], -1)
+    x = torch.cat([batch["observation"], batch["action"] / 2], -1)  # their bounds are -2, 2
     expected = torch.zeros((), dtype=torch.float64)
     for critic in critics.unbind(0):
         hidden = x
@@ -151,7 +152,9 @@ def test_a_gradient_step_moves_weights_and_targets(tmp_path: Path) -> None:
     algorithm.close()
     after = algorithm.model.state_dict()
     for name, value in after.items():
-        if name.startswith("target_"):
+        if name.endswith(("middle", "half_range")):  # of the actions
+            assert torch.equal(value, before[name])
+        elif name.startswith("target_"):
             source = after[name.removeprefix("target_")]
             torch.testing.assert_close(value, 0.9 * before[name] + 0.1 * source)
         elif name.startswith(("actor_", "qvalue_", "log_alpha")):
@@ -159,7 +162,8 @@ def test_a_gradient_step_moves_weights_and_targets(tmp_path: Path) -> None:
             moved = (value - before[name]).abs()
             assert moved.max() == pytest.approx(1e-3, rel=1e-2)
     assert algorithm.model.value_estimator.gamma == 0.5
-    assert algorithm.model.target_entropy == -1
+    # Minus one for actions in units of their bounds, which are -2 and 2.
+    assert algorithm.model.target_entropy == pytest.approx(math.log(2) - 1)
 
 
 @pytest.mark.parametrize(
