@@ -150,7 +150,8 @@ class PPO(OnlineRecipe, algorithm="ppo"):
     initial_std: Positive | None = None
     """Standard deviation of continuous actions at the start, as a share of half the range of each
     entry (0.5 in arXiv 2006.05990); by default 1 in its own units, as in Stable-Baselines3. It can
-    only fall as fast as Adam's learning rate allows. Discrete actions have none."""
+    only fall as fast as Adam's learning rate allows. Discrete actions have none. State-dependent
+    noise (`ppo-gsde`) begins so for features with a mean square of 1; an MLP has smaller ones."""
     initialization: Literal["orthogonal", "own"] = "orthogonal"
     """Initialization of the backbone: orthogonal, as in Stable-Baselines3 and so in the paper's
     online runs, or the network's own (TIT: normal with a standard deviation of 0.02)."""

@@ -254,14 +254,16 @@ def to_networks(batch: TensorDictBase, device: torch.device) -> TensorDictBase:
 def load_weights(networks: Stateful, weights: Mapping[str, Any]) -> None:
     """Loads weights strictly: names, shapes and dtypes must match, and values must be finite.
 
-    ``load_state_dict`` alone converts dtypes, and accepts NaNs.
+    ``load_state_dict`` alone converts dtypes and accepts NaNs, and TorchRL's losses do not miss
+    weights.
 
     Args:
         networks: the networks.
         weights: their state, by name.
 
     Raises:
-        ValueError: if a weight has another dtype, or is not finite where the networks' own is.
+        ValueError: if a weight is missing, has another dtype, or is not finite where the networks'
+            own is.
         RuntimeError: if names or shapes differ.
 
     Example:
@@ -271,6 +273,8 @@ def load_weights(networks: Stateful, weights: Mapping[str, Any]) -> None:
         ValueError: weight has entries that are not finite
     """
     own = networks.state_dict()
+    if missing := [name for name in own if name not in weights]:
+        raise ValueError(f"Missing key {missing[0]}")
     for name, weight in weights.items():
         expected = own.get(name)
         if not (isinstance(weight, Tensor) and isinstance(expected, Tensor)):

@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from recipes.core.algorithm import load_weights
 from recipes.core.metrics import read_metrics
 from recipes.sac import SAC, SACAlgorithm
 from tests.recipes.small import Batches, train
@@ -164,6 +165,16 @@ def test_a_gradient_step_moves_weights_and_targets(tmp_path: Path) -> None:
     assert algorithm.model.value_estimator.gamma == 0.5
     # Minus one for actions in units of their bounds, which are -2 and 2.
     assert algorithm.model.target_entropy == pytest.approx(math.log(2) - 1)
+
+
+def test_no_weight_of_a_critic_may_be_missing(tmp_path: Path) -> None:
+    """TorchRL's losses load their networks' weights without missing any."""
+    algorithm, _ = double(SMALL, tmp_path)
+    weights = algorithm.model.state_dict()
+    name = next(name for name in weights if name.startswith("qvalue_network_params"))
+    del weights[name]
+    with pytest.raises(ValueError, match=f"Missing key {name}"):
+        load_weights(algorithm.model, weights)
 
 
 @pytest.mark.parametrize(
