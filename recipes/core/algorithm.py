@@ -267,10 +267,11 @@ def load_weights(networks: Stateful, weights: Mapping[str, Any]) -> None:
         RuntimeError: if names or shapes differ.
 
     Example:
-        >>> load_weights(torch.nn.Linear(1, 1), {"weight": torch.tensor([[torch.nan]])})
+        >>> linear = torch.nn.Linear(1, 1)
+        >>> load_weights(linear, {**linear.state_dict(), "bias": torch.tensor([torch.nan])})
         Traceback (most recent call last):
             ...
-        ValueError: weight has entries that are not finite
+        ValueError: bias has entries that are not finite
     """
     own = networks.state_dict()
     if missing := [name for name in own if name not in weights]:
