@@ -31,7 +31,7 @@ from torchrl_tit.settings.numbers import (
 
 from .core.algorithm import Terms, descend
 from .core.compilation import check_compiler, compile_and_time, should_compile
-from .core.networks import check_actions, entropy_to_aim_for, is_discrete, make_value_policy
+from .core.networks import check_actions, is_discrete, make_value_policy, target_entropy
 from .core.recipe import Compile
 from .offline import TransitionAlgorithm, TransitionRecipe
 
@@ -173,7 +173,7 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
             num_random=recipe.action_samples,
             over_critics=recipe.over_critics,
             alpha_init=recipe.alpha_init,
-            target_entropy=entropy_to_aim_for(spec),
+            target_entropy=target_entropy(spec),
         )
         loss.make_value_estimator(gamma=recipe.gamma)
         return loss

@@ -23,7 +23,7 @@ from torchrl_tit.settings import Network
 from torchrl_tit.settings.numbers import Fraction, Rate, Widths
 
 from .core.algorithm import Terms, descend
-from .core.networks import check_actions, entropy_to_aim_for
+from .core.networks import check_actions, target_entropy
 from .replay import ReplayAlgorithm, ReplayRecipe
 
 
@@ -87,7 +87,7 @@ class SACAlgorithm(ReplayAlgorithm[SAC]):
             self._policy,
             [self.make_critic(env, spec) for _ in range(2)],
             loss_function="l2",
-            target_entropy=entropy_to_aim_for(spec),
+            target_entropy=target_entropy(spec),
             deactivate_vmap=recipe.backbone.carries_state,  # it cannot map over an LSTM
         )
         loss.make_value_estimator(gamma=recipe.gamma)

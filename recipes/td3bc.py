@@ -13,11 +13,11 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.objectives import TD3BCLoss
 
-from torchrl_tit.modules.action_specs import has_bounds
+from torchrl_tit.modules.action_specs import half_range, has_bounds
 from torchrl_tit.settings.numbers import Rate, Steps, Weight
 
 from .core.algorithm import Stateful, Terms, descend
-from .core.networks import check_actions, half_range, make_deterministic_policy
+from .core.networks import check_actions, make_deterministic_policy
 from .offline import ActorCriticRecipe, TransitionAlgorithm, action_values
 
 
@@ -112,7 +112,7 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
         with first.to_module(critic, preserve_module_state=False):
             values = action_values(critic, samples, chosen)
         bc_loss = ((chosen - samples["action"]) / self.half_range).square().mean()
-        weight = self.recipe.alpha / values.abs().mean().detach()
+        weight = loss.alpha / values.abs().mean().detach()
         return {"loss_actor": bc_loss - weight * values.mean(), "bc_loss": bc_loss.detach()}
 
     def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor]:

@@ -254,8 +254,8 @@ def to_networks(batch: TensorDictBase, device: torch.device) -> TensorDictBase:
 def load_weights(networks: Stateful, weights: Mapping[str, Any]) -> None:
     """Loads weights strictly: names, shapes and dtypes must match, and values must be finite.
 
-    ``load_state_dict`` alone converts dtypes and accepts NaNs, and TorchRL's losses do not miss
-    weights.
+    ``load_state_dict`` alone converts dtypes and accepts NaNs; TorchRL's also accepts states that
+    lack weights.
 
     Args:
         networks: the networks.
@@ -264,7 +264,7 @@ def load_weights(networks: Stateful, weights: Mapping[str, Any]) -> None:
     Raises:
         ValueError: if a weight is missing, has another dtype, or is not finite where the networks'
             own is.
-        RuntimeError: if names or shapes differ.
+        RuntimeError: if there are other names, or shapes differ.
 
     Example:
         >>> linear = torch.nn.Linear(1, 1)

@@ -102,7 +102,7 @@ def _kind(tensor: Tensor) -> str:
 
 def _hyperparameters(names: Iterable[str], algorithm: Algorithm[Any]) -> set[str]:
     """Names of tensors that are not weights: buffers of the losses, and bounds of the actions."""
-    # A loss keeps them under its own name.
+    # Losses keep them under names of their own; critics and deviations have the last two.
     bounds = (*_buffers(algorithm.policy, TanhModule), "half_range", "middle")
     of_losses = _buffers(algorithm.model, LossModule | ValueEstimatorBase)
     return {*of_losses, *(name for name in names if name.endswith(bounds))}

@@ -27,7 +27,7 @@ from torchrl_tit.frames import NormalizedFrames, share_statistics
 from torchrl_tit.frames.observation import Observation, Observations, read_observations
 from torchrl_tit.layers.images import bytes_to_floats
 from torchrl_tit.modules import Backbone, as_sequences, history_keys, make_actor
-from torchrl_tit.modules.action_specs import describe, has_bounds
+from torchrl_tit.modules.action_specs import describe, half_range, has_bounds
 from torchrl_tit.modules.backbone import trunks_of
 from torchrl_tit.modules.sequences import default_observation_keys
 from torchrl_tit.modules.tensor_module import TensorModule, TensorValue
@@ -277,13 +277,11 @@ def check_actions(recipe: Recipe, spec: TensorSpec, fit: bool, needed: str, inst
         )
 
 
-def half_range(bounds: Bounded) -> Tensor:
-    """Half the range of each entry of an action, float [A]."""
-    return (bounds.space.high - bounds.space.low) / 2
+def target_entropy(bounds: Bounded) -> float:
+    """Minus the number of an action's entries, in nats, as in SAC (arXiv 1812.05905).
 
-
-def entropy_to_aim_for(bounds: Bounded) -> float:
-    """Minus the number of entries, as in SAC (arXiv 1812.05905), for actions in their units."""
+    That is for actions from -1 to 1: a wider range adds its logarithm.
+    """
     return half_range(bounds).log().sum().item() - bounds.shape[0]
 
 

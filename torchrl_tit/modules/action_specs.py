@@ -97,6 +97,16 @@ def numbers_of_options(spec: Categorical | OneHot, shape: torch.Size) -> list[in
     return [spec.space.n] * (1 if isinstance(spec, OneHot) else math.prod(shape))
 
 
+def half_range(spec: Bounded) -> Tensor:
+    """Half the range of each entry of an action within bounds, float [A].
+
+    Example:
+        >>> half_range(Bounded(-2, 4, (2,)))
+        tensor([3., 3.])
+    """
+    return (spec.space.high - spec.space.low) / 2
+
+
 def has_bounds(spec: TensorSpec) -> bool:
     """Whether actions are floats [A], each within bounds whose sum and difference are finite.
 
@@ -140,7 +150,7 @@ def initial_scale(spec: TensorSpec, shape: torch.Size, std: float | None) -> Ten
         return torch.ones(math.prod(shape))
     half = torch.ones(spec.shape)
     if isinstance(spec, Bounded):
-        half = (spec.space.high - spec.space.low).to(half) / 2
+        half = half_range(spec).to(half)
     half = half.reshape(-1, math.prod(shape))[0]
     return std * half.where(half.isfinite() & (half > 0), 1.0)
 

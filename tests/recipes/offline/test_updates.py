@@ -421,6 +421,16 @@ def test_critics_read_bytes_as_the_policy_does(tmp_path, kind):
     assert torch.equal(values, critic(floats)["state_action_value"])
 
 
+def test_the_actor_of_td3bc_has_torchrls_loss_where_actions_range_from_minus_1_to_1(tmp_path):
+    data = log_machine(tmp_path / "log.hdf5")
+    recipe = with_spaces(TD3BC(dataset=str(data), backbone=SMALL, critic_hidden=(8,)))
+    algorithm, batch = double(recipe, tmp_path)
+    expected, others = algorithm.model.actor_loss(batch)
+    found = algorithm.actor_loss(batch)
+    torch.testing.assert_close(found["loss_actor"], expected)
+    torch.testing.assert_close(found["bc_loss"], others["bc_loss"])
+
+
 @pytest.mark.parametrize(
     ("kind", "settings"),
     [
