@@ -301,9 +301,9 @@ def _context(
     recipe = groups[0].recipe
     runs = [(group, data) for group in groups for data in group.runs]
     columns = _columns(groups)
-    same = _constants(groups, columns)
     returns = [column for column in columns if "return" in column]
     returns = returns or [column for column in columns if column.startswith("held_out_")][:1]
+    same = _constants(groups, [column for column in columns if column not in returns])
     order = {column: place for place, column in enumerate(known_columns(recipe.algorithm))}
     health = sorted({*columns} - {*returns} - {*same}, key=lambda one: order.get(one, len(order)))
     curves = [_chart(groups, column) for column in returns]
@@ -353,12 +353,12 @@ def _columns(groups: Sequence[Group]) -> list[str]:
 
 
 def _constants(groups: Sequence[Group], columns: Iterable[str]) -> dict[str, float]:
-    """The metrics that have the same value in all rows of all runs, except returns."""
+    """The metrics that have one and the same value wherever runs measured them, more than once."""
     found = {}
     for column in columns:
         values = np.concatenate([one.values(column) for group in groups for one in group.runs])
         values = values[np.isfinite(values)]
-        if "return" not in column and (values == values[0]).all():
+        if len(values) > 1 and (values == values[0]).all():
             found[column] = float(values[0])
     return found
 

@@ -181,6 +181,16 @@ def test_runs_without_an_environment_show_what_was_held_out(tmp_path):
     assert curves.index("held_out_action_error") < curves.index('id="health-of-training"')
 
 
+def test_what_was_measured_once_is_not_called_constant(tmp_path):
+    once = {"held_out_action_error": [np.nan, 0.25], "held_out_nll": [np.nan, 0.5]}
+    columns = {"step": [100, 200], "return_mean": [np.nan] * 2, "epochs": [10, 10], **once}
+    run = write_run(tmp_path / "run", "bc/mlp", metrics=columns, total_updates=200)
+    report(run, "--out", tmp_path / "a.html", "--no-pictures")
+    page = Page(tmp_path / "a.html")
+    assert "These are the same in all rows: epochs 10." in page.text
+    assert [alt for alt in page.alts if "held_out_nll" in alt]
+
+
 def test_settings_under_one_name_that_is_not_registered(tmp_path):
     for width in (4, 8):
         path = tmp_path / str(width)
