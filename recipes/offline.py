@@ -106,7 +106,7 @@ _NEWEST: dict[str, Episodes] = {}
 
 
 def load_data(recipe: Recipe, source: str, **reading: Any) -> Episodes:
-    """Loads a data set as the task writes it: channels first, all that is discrete from 0.
+    """Loads a data set as the task has it: channels first, flat actions, what is discrete from 0.
 
     Args:
         recipe: its task is that of the data.
@@ -127,6 +127,8 @@ def load_data(recipe: Recipe, source: str, **reading: Any) -> Episodes:
     stored = episodes.rows["observation"]
     if spaces is not None:
         _convert(episodes, spaces.observation, recipe.image_layout)
+        if (action := episodes.rows["action"]).ndim > 2:
+            episodes.rows["action"] = action.flatten(1)
     elif stored.ndim == 4:  # images with channels
         kind = np.uint8 if stored.dtype == torch.uint8 else np.float32
         _convert(episodes, Box(0, 255, tuple(stored.shape[1:]), kind), recipe.image_layout)

@@ -53,6 +53,16 @@ def test_negative_log_likelihood(spec: TensorSpec) -> None:
     assert any(weight.grad is not None for weight in loss.parameters())
 
 
+@pytest.mark.parametrize(("spec", "shape"), [(Unbounded(2), (5, 1, 2)), (Categorical(3), (5, 1))])
+def test_actions_that_would_be_broadcast_are_refused(spec, shape):
+    loss = LikelihoodBCLoss(make_actor(8, spec))
+    batch = TensorDict({"features": torch.randn(5, 8), "action": torch.ones(shape)}, [5])
+    with pytest.raises(
+        ValueError, match=r"'action' has the shape \[5, 1.*actions have \[5.*reshape"
+    ):
+        loss(batch)
+
+
 @pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
 def test_padding_does_not_count(reduction):
     """Under the key of TorchRL's `BCLoss`, and with its results."""

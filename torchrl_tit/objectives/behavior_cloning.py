@@ -31,7 +31,7 @@ class LikelihoodBCLoss(BCLoss):
 
     Raises:
         ValueError: if there is no such ``reduction``, or the policy has no ``get_dist`` or is
-            deterministic.
+            deterministic; in ``forward``, if actions do not have the shape of the policy's.
         KeyError: in ``forward``, if ``pad_mask`` is set and the batch has no such entry.
 
     Example:
@@ -78,6 +78,12 @@ class LikelihoodBCLoss(BCLoss):
         action, pad_mask = tensordict[self.tensor_keys.action], self.tensor_keys.pad_mask
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             dist = self.actor_network.get_dist(tensordict.copy())
+        expected = dist.batch_shape + dist.event_shape
+        if action.shape != expected:  # it would be broadcast
+            raise ValueError(
+                f"{self.tensor_keys.action!r} has the shape {list(action.shape)}, but the policy's "
+                f"actions have {list(expected)}: reshape it"
+            )
         loss = -dist.log_prob(action)
         loss = loss if pad_mask is None else loss[~tensordict[pad_mask]]
         if self.reduction != "none":

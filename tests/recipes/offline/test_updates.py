@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ from tests.recipes.small import (
     make_algorithm,
     make_cartpole_data,
     make_data,
+    make_dt,
     tit,
     train,
 )
@@ -400,6 +402,39 @@ def test_data_of_one_of_several_observations(tmp_path, monkeypatch, key, shape):
     batch = next(algorithm.batches())
     assert batch["history"].shape[2:] == shape
     algorithm.update(batch, 0)
+
+
+@pytest.mark.parametrize(
+    ("made", "space"),
+    [
+        (partial(make, BC), "Box"),
+        (partial(make, BC), "MultiBinary"),
+        (partial(make, IQL), "Box"),
+        (partial(make, TD3BC), "Box"),
+        (partial(make, CQL), "Box"),
+        (make_dt, "Box"),
+    ],
+    ids=["bc", "bc-bits", "iql", "td3bc", "cql", "dt"],
+)
+def test_actions_of_two_dimensions_are_flat_as_in_the_task(tmp_path, monkeypatch, made, space):
+    monkeypatch.setenv("TORCHRL_TIT_IMPORTS", "tests.recipes.ppo.tasks")
+    draw, steps = np.random.default_rng(0), 60
+    actions = draw.integers(0, 2, (steps, 2, 2)).astype(np.float32 if space == "Box" else np.int8)
+    arrays = {
+        "observations": draw.random((steps, 3), np.float32),
+        "actions": actions,
+        "rewards": draw.random(steps),
+        "terminals": np.arange(steps) % 10 == 9,
+        "timeouts": np.zeros(steps, bool),
+    }
+    task = {"env": f"tests.recipes.ppo.tasks:{space}Actions-v0", "observation_keys": ("state/0",)}
+    recipe = made(tmp_path, **task, dataset=str(write(tmp_path / "a.hdf5", arrays)))
+    episodes = read_data(recipe)
+    found = episodes.rows["action"][episodes.step_rows].numpy()
+    np.testing.assert_array_equal(found, actions.reshape(steps, 4))
+    algorithm = make_algorithm(recipe)
+    algorithm.prepare(0, tmp_path)
+    algorithm.update(next(algorithm.batches()), 0)
 
 
 @pytest.mark.parametrize("kind", [IQL, TD3BC, CQL])
