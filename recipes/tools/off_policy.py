@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
@@ -72,7 +73,9 @@ def evaluate_on_data(
         raise ValueError(f"{run.folder} is a run of {recipe.algorithm}, which reads no data sets")
     own: DatasetRecipe = algorithm.recipe
     episodes = read_data(replace(own, dataset=dataset))
-    found = algorithm.measure(step, episodes)
+    with warnings.catch_warnings():  # nothing is trained, so nothing moves the targets
+        warnings.filterwarnings("ignore", "No target network updater")
+        found = algorithm.measure(step, episodes)
     assert found is not None
     weights = "best" if best else "last"
     evaluation = {"env": "", "dataset": dataset, **found.entries(), "weights": weights}

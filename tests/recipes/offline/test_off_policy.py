@@ -246,12 +246,14 @@ def test_behavior_is_cloned_and_not_learnt_by_heart(tmp_path):
     assert (likely - (0.25 + 0.5 * right)).abs().mean() < 0.12
 
 
-def test_the_command(tmp_path, monkeypatch, capsys):
+def test_the_command(tmp_path, monkeypatch, capsys, recwarn):
     monkeypatch.setattr(off_policy, "UPDATES", {"fqe": 5, "wis": 5})
     data = str(log_machine(tmp_path / "log.hdf5"))
     recipe = with_spaces(IQL(dataset=data, backbone=SMALL, total_updates=2, name="iql/mine"))
     run = train(recipe, tmp_path / "run")
+    recwarn.clear()
     main(["evaluate", str(run.folder), "--dataset", data, "--ope", "fqe", "--best"])
+    assert not [x for x in recwarn if "target network" in str(x.message)]
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("iql/mine: after 2 updates (best weights, chosen on held-out")
     assert lines[1].startswith("discounted return (0.99) by fqe: ")
