@@ -107,6 +107,10 @@ def _describe(error: Exception) -> str:
             "there is not enough memory: a smaller network, num_frames, num_envs, minibatch_size "
             f"or batch_size needs less ({text})"
         )
+    if isinstance(error, FileExistsError | NotADirectoryError) and error.filename:
+        return (
+            f"{error.strerror}: {error.filename!r}: a file is in the way, so choose another place"
+        )
     return text
 
 

@@ -319,6 +319,13 @@ MIXED = Dict({"pose": Box(-1, 1, (2,)), "speech": Text(3)})
         (Dict({}), {}, ValueError, "none at all"),
         (MIXED, {"keys": ["speech"]}, ValueError, "not supported: 'speech'"),
         (MIXED, {"keys": ["pos"]}, ValueError, "no observation 'pos'.* only pose, speech"),
+        (Dict({"a.b": Discrete(2), "a_b": Discrete(3)}), {}, ValueError, 'two .*"a_b".*rename'),
+        (
+            Dict({"a/b": Discrete(2), "a": Dict({"b": Discrete(3)})}),
+            {"keys": ["a/b"]},
+            ValueError,
+            'two observations with the name "a/b"',
+        ),
     ],
 )
 def test_observations_that_cannot_be_read(space, settings, kind, words):
@@ -336,6 +343,18 @@ def test_actions_and_masks_that_are_not_supported():
         echo(Box(-1, 1), mask_actions=True)
     with pytest.raises(ValueError, match='"action_mask" has 4 entries, but there are 3 actions'):
         echo(Discrete(3), Dict(action_mask=MultiBinary(4), at=Discrete(2)), mask_actions=True)
+
+
+def test_a_reward_that_is_an_array():
+    class Payer(Echo):
+        def step(self, action):
+            observation, _, *rest = super().step(action)
+            return observation, np.ones(1), *rest
+
+    tasks = [lambda: Payer(Discrete(2))]
+    env = GymVectorEnv(SyncVectorEnv(tasks, autoreset_mode=AutoresetMode.DISABLED))
+    with pytest.raises(ValueError, match="returns an array as its reward: return a float"):
+        env.rollout(1)
 
 
 class Arm(gymnasium.Env):

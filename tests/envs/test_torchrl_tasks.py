@@ -287,6 +287,9 @@ def test_text_is_left_out():
         assert TensorReader(specs).spec.shape == (1,)
     with pytest.raises(ValueError, match="not supported: 'note'"):
         TensorReader(Composite(note=NonTensor(shape=())))
+    place = Categorical(3)
+    with pytest.raises(ValueError, match='two observations with the name "place"'):
+        TensorReader(Composite(place=place, observation=Composite(place=place)))
 
 
 @pytest.mark.parametrize(

@@ -76,6 +76,9 @@ def test_bad_input():
         make_env(  # with one more entry at the front
             "Hopper-v5", hide_velocities=True, exclude_current_positions_from_observation=False
         )
+    wrappers = ["gymnasium.wrappers:TimeAwareObservation(flatten=False)"]
+    with pytest.raises(ValueError, match=r"with other names \(obs, time\): leave one of them out"):
+        make_env("CartPole-v1", hide_velocities=True, wrappers=wrappers)
     with pytest.raises(ValueError, match=r"hidden is \[1, 1\]"):
         HideEntries([1, 1])
     for hidden in ([4], [0, 1, 2, 3]):

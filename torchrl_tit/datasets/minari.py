@@ -128,7 +128,10 @@ def read_minari(name: str | os.PathLike[str], **settings: Any) -> Episodes:
             source, f"is not a whole Minari data set ({error}): see {path}."
         ) from error
     if space.type not in ("Box", "Discrete", "MultiDiscrete", "MultiBinary"):
-        problem = f"its observations are a {space.type} space, but must be one array."
+        problem = (
+            f"its observations are a {space.type} space, but must be one array: store the one to "
+            "read."
+        )
         raise DatasetError(source, problem)
     if metadata.data_format != "hdf5":
         raise DatasetError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -90,7 +90,7 @@ class ObservationReader:
         image_layout: ImageLayout = "auto",
         mask_actions: bool = False,
     ) -> None:
-        found = dict(_leaf_spaces(space))
+        found = by_name(_leaf_spaces(space))
         masks = [name for name in found if mask_actions and _belongs(name, MASK)]
         self._mask_paths = [found.pop(name)[0] for name in masks]
         self.leaves = {
@@ -312,13 +312,31 @@ def only_space(space: Space, keys: Sequence[str] = ()) -> Space:
     """
     if not keys and not isinstance(space, Dict | Tuple):
         return space
-    chosen = [part for _, part in choose(dict(_leaf_spaces(space)), keys, _is_supported).values()]
+    chosen = [
+        part for _, part in choose(by_name(_leaf_spaces(space)), keys, _is_supported).values()
+    ]
     return chosen[0] if len(chosen) == 1 else space
 
 
 def leaf_name(keys: Iterable[str]) -> str:
     """The name of a nested observation, without dots, which names of modules cannot have."""
     return "/".join(keys).replace(".", "_")
+
+
+ValueT = TypeVar("ValueT")
+
+
+def by_name(observations: Iterable[tuple[str, ValueT]]) -> dict[str, ValueT]:
+    """Makes a dictionary of observations, and raises ValueError if two have one name."""
+    found: dict[str, ValueT] = {}
+    for name, value in observations:
+        if name in found:
+            raise ValueError(
+                f'The task has two observations with the name "{name}" (a dot in a name becomes '
+                '"_", and levels are joined by "/"): rename one of them.'
+            )
+        found[name] = value
+    return found
 
 
 def _leaf_spaces(

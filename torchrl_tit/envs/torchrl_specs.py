@@ -22,7 +22,7 @@ from torchrl.data import (
 
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.envs.actions import box_action_spec
-from torchrl_tit.envs.spaces import array_spec, choose, group, leaf_name
+from torchrl_tit.envs.spaces import array_spec, by_name, choose, group, leaf_name
 from torchrl_tit.modules.action_specs import describe
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import ImageLayout
@@ -63,7 +63,7 @@ class TensorReader:
         image_layout: ImageLayout = "auto",
         mask_actions: bool = False,
     ) -> None:
-        found = {_name(key): (key, specs[key]) for key in specs.keys(True, True)}
+        found = by_name((_name(key), (key, specs[key])) for key in specs.keys(True, True))
         self.mask_key: NestedKey | None = None
         """Key of the action mask, if it is read."""
         if mask_actions:

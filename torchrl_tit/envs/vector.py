@@ -126,7 +126,12 @@ class GymVectorEnv(EnvBase):
         action = tensordict["action"].detach().cpu()
         if action.is_floating_point():
             refuse_nan(action)
-        stepped = self._env.step(self._write(action).numpy())
+        try:
+            stepped = self._env.step(self._write(action).numpy())
+        except ValueError as error:
+            if "array element with a sequence" in str(error):  # Gymnasium's message names nothing
+                raise ValueError("A task returns an array as its reward: return a float.") from None
+            raise
         observations, rewards, terminated, truncated, info = stepped
         return self._tensordict(
             **self._observed(observations, info, terminated | truncated),

@@ -74,6 +74,11 @@ MISTAKES = [
     ("share run --out 'a b'", "name must be letters"),
     ("examples", "the following arguments are required: OUT"),
     ("examples run", "run exists already"),
+    (
+        "train ppo/cartpole/mlp --out mine.png/run",
+        "'mine.png/run': a file is in the way, so choose",
+    ),
+    ("tune ppo/cartpole/mlp --out mine.png", "'mine.png': a file is in the way, so choose"),
     ("export empty --out a.pt2", "holds no checkpoint: train the run first"),
     ("export nothing --out a.pt2", "neither an agent nor a run"),
     ("export nobody --out a.pt2", "there is no agent or folder 'nobody'"),
