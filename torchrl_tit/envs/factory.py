@@ -186,13 +186,13 @@ def make_env(
     if hide_velocities:
         whole = ("observation", "observation")  # beside other observations, such as PreviousStep's
         keys = [key for key in keys_of(env) if key in ("observation", whole)]
+        env.append_transform(HideVelocities(name, keys))
         if not keys:
             found = ", ".join(str(key[-1]) for key in keys_of(env))
             raise ValueError(
                 f"hide_velocities takes entries from the observation of {name}, but its wrappers "
                 f"{list(wrappers)} make several with other names ({found}): leave one of them out"
             )
-        env.append_transform(HideVelocities(name, keys))
     env.append_transform(RewardSum())
     env.append_transform(History(num_frames, keys_of(env), padding=padding))
     return env

@@ -312,9 +312,8 @@ def only_space(space: Space, keys: Sequence[str] = ()) -> Space:
     """
     if not keys and not isinstance(space, Dict | Tuple):
         return space
-    chosen = [
-        part for _, part in choose(by_name(_leaf_spaces(space)), keys, _is_supported).values()
-    ]
+    found = choose(by_name(_leaf_spaces(space)), keys, _is_supported)
+    chosen = [part for _, part in found.values()]
     return chosen[0] if len(chosen) == 1 else space
 
 
