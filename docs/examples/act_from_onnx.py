@@ -34,7 +34,7 @@ class Agent:
         """Maps an observation, or those of N copies, [N, ...], to actions; holds values for NaN."""
         shape = tuple(self.facts["inputs"]["observation"]["shape"])
         unknown = np.full(self.given or shape, np.nan)
-        frames = np.atleast_1d(unknown if observation is None else observation)
+        frames = np.array(unknown if observation is None else observation, ndmin=1)  # a copy
         several = frames.ndim > len(shape)
         if frames.shape[several:] != shape:
             raise ValueError(f"expected observations {shape} or N of them, not {frames.shape}")

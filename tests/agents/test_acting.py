@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+from copy import deepcopy
 from functools import cache, reduce
 from itertools import product
 from pathlib import Path
@@ -134,6 +135,57 @@ def test_missing_values_are_held(made):
     agent.reset()
     with pytest.raises(ValueError, match="observations of 0 copies"):
         agent.act(np.zeros((0, 11)))
+
+
+@pytest.mark.parametrize("exported", [False, True])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_arrays_that_the_caller_writes_again(made, tmp_path, exported, dtype):
+    agent = made("frames")
+    frames = np.random.default_rng(0).normal(size=(3, 3)).astype(dtype)
+    expected = [agent.act(frame) for frame in (*frames[:2], [frames[1, 0], *frames[2, 1:]])]
+    agent.reset()
+    if exported:
+        pytest.importorskip("onnxruntime")
+        pytest.importorskip("onnxscript")
+        file = tmp_path / "agent.onnx"
+        export_policy(agent.policy, agent.make_env, file, step_by_step=True)
+        agent = runpy.run_path(str(EXAMPLE))["Agent"](str(file))
+    frames[2, 0] = np.nan
+    buffer = np.empty(3, dtype)
+    for frame, action in zip(frames, expected, strict=True):
+        buffer[:] = frame
+        np.testing.assert_allclose(agent.act(buffer), action, rtol=1e-4, atol=1e-5)
+
+
+def test_actions_that_the_caller_writes_again(made):
+    agent, frames = made("dt"), np.random.default_rng(0).normal(size=(5, 11))
+    expected = [agent.act(frame).copy() for frame in frames]
+    agent.reset()
+    for frame, action in zip(frames, expected, strict=True):
+        given = agent.act(frame)
+        np.testing.assert_array_equal(given, action)
+        given[...] = 7
+
+
+@pytest.mark.parametrize("name", ["frames", "dt", "lstm"])
+def test_a_copy_has_its_own_history_and_weights(made, name):
+    agent = made(name)
+    [size] = tasks(agent, 1)[0].observation_space.shape
+    frames = np.random.default_rng(0).normal(size=(3, size))
+    expected = [agent.act(frame) for frame in frames]
+    agent.reset()
+    agent.act(frames[0])
+    other = deepcopy(agent)
+    agent.act(-frames[1])
+    for frame, action in zip(frames[1:], expected[1:], strict=True):
+        np.testing.assert_array_equal(other.act(frame), action)
+    first = agent.evaluate(1)
+    torch.testing.assert_close(other.evaluate(1), first, rtol=0, atol=0)
+    with torch.no_grad():
+        for weight in other.policy.parameters():
+            weight.mul_(-2)
+    assert other.evaluate(1) != first
+    torch.testing.assert_close(agent.evaluate(1), first, rtol=0, atol=0)
 
 
 def test_what_is_refused_leaves_nothing_behind(made, tmp_path):

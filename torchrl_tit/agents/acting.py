@@ -131,7 +131,7 @@ class Actor:
                 _, steps = self._env.step_and_maybe_reset(self._steps)
             self._steps = self._policy(steps)
         taken = self._env.transform.inv(self._steps.copy())["action"]  # as the environment does
-        action = self._to_task(taken.cpu()).numpy()
+        action = self._to_task(taken.cpu()).clone().numpy()  # the past actions stay ours
         self._begins = torch.zeros_like(self._begins)
         return action if self._batched else action[0]
 
@@ -154,9 +154,12 @@ class Actor:
             raise ValueError("there are observations of 0 copies: give those of at least one")
         writer = getattr(base, "action_writer", None)
         self._to_task: Callable[[Tensor], Tensor] = writer or (lambda action: action)
-        self._env = _given(base, transforms, lambda begins: self._given, copies)
+        self._env = _given(base, transforms, self._feed, copies)
         self._begins = torch.zeros(copies, 1, dtype=torch.bool)
         self._last: dict[str, Tensor] = {}
+
+    def _feed(self, begins: bool) -> Mapping[str, Any]:
+        return self._given
 
     def _read(self, observation: Any) -> Any:
         spec = self._specs["observation"]
@@ -188,7 +191,7 @@ class Actor:
                     f"the {name} has the shape {list(array.shape)}, but must have {expected}{hint}"
                 )
             numbers = torch.as_tensor(np.ascontiguousarray(array)).reshape(shape)
-            missing, frame = numbers.isnan(), numbers.to(spec.dtype)
+            missing, frame = numbers.isnan(), numbers.to(spec.dtype, copy=True)  # theirs may change
             floats = spec.dtype.is_floating_point
             if floats and frame.isinf().any():
                 raise ValueError(

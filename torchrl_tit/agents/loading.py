@@ -99,7 +99,8 @@ class TrainedAgent:
 
         They are those of :attr:`make_env`: histories, the return that a Decision Transformer aims
         for, the state of a recurrent network. Each call makes new ones, because transforms belong
-        to one environment.
+        to one environment. They do not clip continuous actions to their bounds, which the task of
+        :attr:`make_env` does: a Gaussian policy needs `ClipAction` of Gymnasium there.
 
         Example:
             >>> from torchrl.envs import GymEnv, TransformedEnv

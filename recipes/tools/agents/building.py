@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -118,18 +119,13 @@ def _agent(
         steps=steps,
         evaluation=evaluation,
         versions=versions,
-        plays=_plays(algorithm, steps),
+        plays=partial(_play, algorithm, steps),  # a closure would not be copied
     )
 
 
-def _plays(algorithm: Algorithm[Any], steps: int) -> Callable[[int, int], list[float]]:
-    """Returns a function that plays episodes as the algorithm's evaluation does."""
-    recipe = algorithm.recipe
-
-    def plays(episodes: int, seed: int) -> list[float]:
-        if not recipe.env:
-            raise ValueError("there is no environment to play in: act on observations with act()")
-        algorithm.recipe = replace(recipe, evaluation_episodes=episodes, evaluation_seed=seed)
-        return algorithm.play(steps)[0].returns
-
-    return plays
+def _play(algorithm: Algorithm[Any], steps: int, episodes: int, seed: int) -> Sequence[float]:
+    """Plays episodes as the algorithm's evaluation does."""
+    if not algorithm.recipe.env:
+        raise ValueError("there is no environment to play in: act on observations with act()")
+    algorithm.recipe = replace(algorithm.recipe, evaluation_episodes=episodes, evaluation_seed=seed)
+    return algorithm.play(steps)[0].returns
