@@ -131,7 +131,7 @@ class Actor:
                 _, steps = self._env.step_and_maybe_reset(self._steps)
             self._steps = self._policy(steps)
         taken = self._env.transform.inv(self._steps.copy())["action"]  # as the environment does
-        action = self._to_task(taken.cpu()).clone().numpy()  # the past actions stay ours
+        action = self._to_task(taken.cpu()).clone().numpy()  # the caller may change it
         self._begins = torch.zeros_like(self._begins)
         return action if self._batched else action[0]
 
@@ -191,7 +191,8 @@ class Actor:
                     f"the {name} has the shape {list(array.shape)}, but must have {expected}{hint}"
                 )
             numbers = torch.as_tensor(np.ascontiguousarray(array)).reshape(shape)
-            missing, frame = numbers.isnan(), numbers.to(spec.dtype, copy=True)  # theirs may change
+            missing = numbers.isnan()
+            frame = numbers.to(spec.dtype, copy=True)  # the caller may reuse the array
             floats = spec.dtype.is_floating_point
             if floats and frame.isinf().any():
                 raise ValueError(

@@ -119,7 +119,7 @@ def _agent(
         steps=steps,
         evaluation=evaluation,
         versions=versions,
-        plays=partial(_play, algorithm, steps),  # a closure would not be copied
+        plays=partial(_play, algorithm, steps),  # deepcopy shares closures
     )
 
 
