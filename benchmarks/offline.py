@@ -1,9 +1,9 @@
 """One update of CQL_TIT, IQL and BC with K = 4: this library compared with d3rlpy, on one batch.
 
 The settings are those of ``cql/enhanced-tit``, ``iql/enhanced-tit`` and ``bc/enhanced-tit``, but
-observations are not normalized. Both have the same networks: d3rlpy's actor reads the four
-observations through our Enhanced_TIT, and its critics read the newest one. Its behavior cloning is
-of squared errors, ours of likelihoods.
+observations are not normalized. Losses run as they are and compiled. Both libraries have the same
+networks: d3rlpy's actor reads the four observations through our Enhanced_TIT, and its critics read
+the newest one. Its behavior cloning is of squared errors, ours of likelihoods.
 
 d3rlpy pins a different version of Gymnasium from this project's, for environments that are not
 needed here. Install it without its dependencies:
@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from d3rlpy.algos import BCConfig, CQLConfig, IQLConfig
@@ -97,12 +97,14 @@ def make_batch() -> TensorDictBase:
     return TensorDict({**states(), "action": action, "next": following}, [256])
 
 
-def make_ours(recipe: Any) -> Callable[[TensorDictBase], Any]:
+def make_ours(
+    recipe: Any, compile: Literal["on", "off"] = "off"
+) -> Callable[[TensorDictBase], Any]:
     """Our update."""
-    algorithm = recipe.build()
+    algorithm = replace(recipe, compile=compile).build()
     algorithm.make_buffer = ReplayBuffer  # batches are made here
     algorithm.prepare(0, Path())
-    return lambda batch: algorithm.update(batch, 0)
+    return lambda batch: algorithm.update(batch.copy(), 0)  # losses write into it
 
 
 def make_theirs(recipe: Any) -> Callable[[TensorDictBase], Any]:
@@ -147,7 +149,11 @@ def main() -> dict[str, Any]:
     found, batch = {}, make_batch()
     for name in ("cql", "iql", "bc"):
         recipe = recipe_of(name)
-        steps = {"d3rlpy": make_theirs(recipe), "this library": make_ours(recipe)}
+        steps = {
+            "d3rlpy": make_theirs(recipe),
+            "this library": make_ours(recipe),
+            "compiled": make_ours(recipe, "on"),
+        }
         times = take_turns({k: partial(step, batch) for k, step in steps.items()}, ROUNDS, SECONDS)
         found[name] = {"ms": times, "ratios": ratios(times["d3rlpy"], times["this library"])}
     return found

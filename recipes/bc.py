@@ -75,7 +75,7 @@ class BCAlgorithm(TransitionAlgorithm[BC]):
 
     def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor]:
         """Takes a gradient step on transitions [B] or slices [N, T]."""
-        terms = self.loss(batch)
+        terms = self._loss(batch)
         descend(terms, self.optimizer)
         return self.numbers(terms)
 

@@ -6,7 +6,7 @@ one of ``networks`` and ``loss``, or ``actor_loss``: docs/how-to/change-sac-dqn-
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
@@ -30,9 +30,7 @@ from torchrl_tit.settings.numbers import (
 )
 
 from .core.algorithm import Terms, descend
-from .core.compilation import check_compiler, compile_and_time, should_compile
 from .core.networks import check_actions, is_discrete, make_value_policy, target_entropy
-from .core.recipe import Compile
 from .offline import TransitionAlgorithm, TransitionRecipe
 
 
@@ -52,45 +50,19 @@ class ConservativeRecipe(TransitionRecipe):
     """Coefficient of the soft update of the target networks at each gradient step, from 0 to 1."""
     conservative_weight: Weight = 5.0
     """Weight of the conservative term."""
-    compile: Compile = "auto"
-    """Whether the losses run through torch.compile, which needs a C++ compiler and about a minute
-    at the start. "auto" compiles on a GPU, if the run is long enough to be worth it: on a CPU,
-    compiling does not speed up the critics' matrix products. Slices of several transitions are
-    never compiled."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.compile == "on" and self.slice_length > 1:
-            raise ValueError(
-                f"compile is on, but slices of {self.slice_length} are not compiled, because their "
-                "number of frames varies: set compile to off, or slice_length to 1"
-            )
 
 
 RecipeT = TypeVar("RecipeT", bound=ConservativeRecipe)
 
 
 class ConservativeAlgorithm(TransitionAlgorithm[RecipeT]):
-    """An algorithm whose losses may run through ``torch.compile``.
+    """What both kinds of conservative Q-learning share.
 
     Args:
         recipe: the settings.
     """
 
     terminal_observations: ClassVar[Literal["keep", "zero"]] = "zero"  # as in d3rlpy 1.1.1
-
-    def compiled(self, function: Callable[..., Any], name: str) -> Callable[..., Any]:
-        """Compiles a function of a batch if the recipe says so, which ``name`` names."""
-        setting, recipe = self.recipe.compile, self.recipe
-        pays = setting == "on" or (self.device.type == "cuda" and recipe.slice_length == 1)
-        if pays and should_compile(setting, recipe.total_updates):
-            return compile_and_time(function, name, self)
-        return function
-
-    def check(self) -> None:
-        """As :meth:`DatasetAlgorithm.check`; also checks that there is a compiler if requested."""
-        check_compiler(self.recipe.compile)
-        super().check()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,10 +151,9 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
         return loss
 
     def prepare(self, step: int, folder: Path) -> None:
-        """As :meth:`TransitionAlgorithm.prepare`; also compiles the losses, if that pays."""
+        """As :meth:`TransitionAlgorithm.prepare`; also compiles the actor's part, if that pays."""
         super().prepare(step, folder)
         self._sample_policy = self.compiled(self.model.sample_policy, "the policy")
-        self._loss = self.compiled(self.loss, "the critics' loss")
         self._actor_loss = self.compiled(self.actor_loss, "the actor's loss")
         self._cloning_loss = self.compiled(self.cloning_loss, "the actor's cloning loss")
 
@@ -283,11 +254,6 @@ class DiscreteCQLAlgorithm(ConservativeAlgorithm[DiscreteCQL]):
         loss = DelayedDiscreteCQLLoss(self._policy, action_space="categorical")
         loss.make_value_estimator(gamma=recipe.gamma)
         return loss
-
-    def prepare(self, step: int, folder: Path) -> None:
-        """As :meth:`TransitionAlgorithm.prepare`; also compiles the loss, if that pays."""
-        super().prepare(step, folder)
-        self._loss = self.compiled(self.loss, "the loss")
 
     def loss(self, samples: TensorDictBase) -> Terms:
         """Returns the terms of the loss; see :meth:`TransitionAlgorithm.loss`."""

@@ -131,7 +131,7 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
         if recipe.decay_learning_rate:
             fall = (1 + math.cos(math.pi * step / recipe.total_updates)) / 2
             self.optimizer.param_groups[0]["lr"] = recipe.learning_rate * fall
-        terms = self.loss(batch)
+        terms = self._loss(batch)
         descend(terms, self.optimizer)
         self.target.step()
         return self.numbers(terms)

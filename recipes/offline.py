@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -50,6 +50,7 @@ from .core.algorithm import (
     storage_device,
     to_networks,
 )
+from .core.compilation import check_compiler, compile_and_time, should_compile
 from .core.evaluation import HeldOut
 from .core.networks import (
     LearnsFromSamples,
@@ -58,7 +59,7 @@ from .core.networks import (
     set_statistics,
     state_transforms,
 )
-from .core.recipe import DatasetRecipe, Recipe, SamplesRecipe
+from .core.recipe import Compile, DatasetRecipe, Recipe, SamplesRecipe
 from .core.task import make_task
 
 
@@ -391,6 +392,18 @@ class TransitionRecipe(DatasetRecipe, SamplesRecipe):
     """Gradient steps between evaluations."""
     evaluation_episodes: EpisodeCount = 10
     """Number of episodes in an evaluation, played side by side."""
+    compile: Compile = "auto"
+    """Whether the losses run through torch.compile, which needs a C++ compiler and about a minute
+    at the start. "auto" compiles if that works and the run is long enough to be worth it. Slices
+    of several transitions are never compiled."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.compile == "on" and self.slice_length > 1:
+            raise ValueError(
+                f"compile is on, but slices of {self.slice_length} are not compiled, because their "
+                "number of frames varies: set compile to off, or slice_length to 1"
+            )
 
     @property
     def final_step(self) -> int:
@@ -495,7 +508,10 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
         return make_task(self.recipe, num_envs, seed, state=state, clip_actions=clips, **settings)
 
     def prepare(self, step: int, folder: Path) -> None:
-        """Builds optimizer, target update (if there are targets) and replay buffer."""
+        """Builds optimizer, target update (if there are targets) and replay buffer.
+
+        Compiles the loss, if that pays.
+        """
         recipe: Any = self.recipe
         groups: dict[str, list[nn.Parameter]] = {start: [] for start in self.rates}
         for name, parameter in self.model.named_parameters():
@@ -507,6 +523,19 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
         if hasattr(recipe, "tau"):
             self.target = SoftUpdate(self.model, tau=recipe.tau)
         self.buffer = self.make_buffer()
+        self._loss = self.compiled(self.loss, "the loss")
+
+    def compiled(self, function: Callable[..., Any], name: str) -> Callable[..., Any]:
+        """Compiles a function of a batch if the recipe says so, which ``name`` names."""
+        recipe = self.recipe
+        if recipe.slice_length == 1 and should_compile(recipe.compile, recipe.total_updates):
+            return compile_and_time(function, name, self)
+        return function
+
+    def check(self) -> None:
+        """As :meth:`DatasetAlgorithm.check`; also checks that there is a compiler if requested."""
+        check_compiler(self.recipe.compile)
+        super().check()
 
     def state(self) -> Mapping[str, Stateful]:
         """Optimizer, and the sampling state of the replay buffer."""

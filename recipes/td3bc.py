@@ -86,6 +86,7 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
     def prepare(self, step: int, folder: Path) -> None:
         """As :meth:`TransitionAlgorithm.prepare`, with the terms of the actor's last update."""
         super().prepare(step, folder)
+        self._actor_loss = self.compiled(self.actor_loss, "the actor's loss")
         self.actor_terms = nn.Module()
         """The actor's terms at its last update, which steps without an update report again."""
         self.actor_terms.register_buffer("values", torch.zeros(2, device=self.device))
@@ -120,10 +121,10 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
 
         A batch is transitions [B], or slices [N, T].
         """
-        terms, values = dict(self.loss(batch)), self.actor_terms.get_buffer("values")
+        terms, values = dict(self._loss(batch)), self.actor_terms.get_buffer("values")
         descend(terms, self.optimizer)
         if step % self.recipe.policy_delay == 0:
-            actor_terms = self.actor_loss(batch)
+            actor_terms = self._actor_loss(batch)
             descend(actor_terms, self.optimizer)
             self.target.step()
             values.copy_(torch.stack([actor_terms["loss_actor"], actor_terms["bc_loss"]]).detach())

@@ -7,6 +7,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
+from copy import deepcopy
 from functools import cache, wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -35,6 +36,7 @@ take its numbers (heads, activations, weights of losses) for its own."""
 
 # Compiling takes about a minute, and each gradient step then saves a few milliseconds.
 _PAYS_FROM = 10_000
+_KNOWN = ("torchrl_tit", "torchrl", "tensordict", "torch")
 _COMPILERS = (os.environ.get("CXX", "c++"), "g++", "clang++", "cl")
 
 
@@ -78,18 +80,20 @@ def check_compiler(setting: Compile) -> None:
 def compile_and_time(function: Callable[P, T], name: str, owner: Algorithm[Any]) -> Callable[P, T]:
     """Compiles a function, and prints how long its first call took, which includes compilation.
 
-    Between calls, only tensors change in the algorithms of this package, and no mode and no number.
-    A user's subclass may change numbers, which code without guards would keep as they were in the
-    first call.
+    Between calls, only tensors change in the algorithms and modules of this package and of those it
+    builds on, and no mode and no number. A user's may change numbers, which code without guards
+    would keep as they were in the first call, or do what has no graph, such as printing.
 
     Args:
         function: the function.
         name: what it is, for the message.
         owner: the algorithm that calls it.
     """
-    package = str(__package__).rpartition(".")[0]
-    ours = type(owner).__module__.startswith(f"{package}.")
-    fast = torch.compile(function, **(ONLY_TENSORS if ours else STATIC_SHAPES))
+    known = (*_KNOWN, str(__package__).partition(".")[0])
+    parts = (owner, *owner.model.modules(), *owner.policy.modules())
+    ours = all(type(part).__module__.partition(".")[0] in known for part in parts)
+    # torch.compile takes the filter out of the options that it is given.
+    fast = torch.compile(function, **deepcopy(ONLY_TENSORS if ours else STATIC_SHAPES))
     first = True
 
     @wraps(function)

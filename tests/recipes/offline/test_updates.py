@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import shutil
+from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -11,11 +13,13 @@ import numpy as np
 import pytest
 import torch
 from tensordict.nn import set_skip_existing
+from torch import nn
 from torch.nn import functional as F
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import BCLoss
 
 from recipes.bc import BCAlgorithm
+from recipes.core.compilation import compile_and_time
 from recipes.core.networks import ActionMLP
 from recipes.cql import CQL, DiscreteCQL
 from recipes.dqn import DQN
@@ -458,7 +462,9 @@ def test_critics_read_bytes_as_the_policy_does(tmp_path, kind):
 
 def test_the_actor_of_td3bc_has_torchrls_loss_where_actions_range_from_minus_1_to_1(tmp_path):
     data = log_machine(tmp_path / "log.hdf5")
-    recipe = with_spaces(TD3BC(dataset=str(data), backbone=SMALL, critic_hidden=(8,)))
+    recipe = with_spaces(
+        TD3BC(dataset=str(data), backbone=SMALL, critic_hidden=(8,), compile="off")
+    )
     algorithm, batch = double(recipe, tmp_path)
     expected, others = algorithm.model.actor_loss(batch)
     found = algorithm.actor_loss(batch)
@@ -472,7 +478,7 @@ def test_the_actor_of_td3bc_has_torchrls_loss_where_actions_range_from_minus_1_t
         (BC, {}),
         (IQL, {"critic_hidden": (8,)}),
         (TD3BC, {"critic_hidden": (8,)}),
-        (CQL, {"critic_hidden": (8,), "cloning_updates": 3, "compile": "off"}),
+        (CQL, {"critic_hidden": (8,), "cloning_updates": 3}),
     ],
 )
 def test_policies_do_not_depend_on_the_units_of_the_actions(tmp_path, kind, settings):
@@ -484,7 +490,8 @@ def test_policies_do_not_depend_on_the_units_of_the_actions(tmp_path, kind, sett
     for unit, middle in (((1.0, 1.0), (0.0, 0.0)), ((0.03125, 64.0), (3.0, -16.0))):
         logged = actions.astype(np.float32) * unit + np.array(middle)
         data = log_machine(tmp_path / f"{middle}.hdf5", 60, actions=logged)
-        recipe = kind(dataset=str(data), backbone=SMALL, batch_size=16, **settings)
+        fixed = {"backbone": SMALL, "batch_size": 16, "compile": "off"}
+        recipe = kind(dataset=str(data), **fixed, **settings)
         algorithm, batch = double(with_spaces(recipe), tmp_path)
         torch.manual_seed(1)
         for step in range(6):
@@ -493,3 +500,70 @@ def test_policies_do_not_depend_on_the_units_of_the_actions(tmp_path, kind, sett
             chosen = algorithm.policy(batch.clone())["action"]
         found.append((chosen - torch.tensor(middle)) / torch.tensor(unit))
     torch.testing.assert_close(*found, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "expected"),
+    [
+        (BC, {}, ["the loss"]),
+        (IQL, {}, ["the loss"]),
+        (IQL, {"total_updates": 9999}, []),
+        (IQL, {"slice_length": 2}, []),
+        (IQL, {"compile": "off"}, []),
+        (TD3BC, {}, ["the loss", "the actor's loss"]),
+        (DiscreteCQL, {}, ["the loss"]),
+        (
+            CQL,
+            {"compile": "on", "total_updates": 1},
+            ["the loss", "the policy", "the actor's loss", "the actor's cloning loss"],
+        ),
+    ],
+)
+def test_losses_are_compiled_where_that_pays(tmp_path, monkeypatch, kind, settings, expected):
+    compiled = []
+    monkeypatch.setattr(shutil, "which", lambda name: name)
+    monkeypatch.setattr("recipes.core.compilation._works", lambda: True)
+    monkeypatch.setattr(
+        "recipes.offline.compile_and_time", lambda function, name, owner: compiled.append(name)
+    )
+    algorithm = make_algorithm(make(kind, tmp_path, **{"total_updates": 10_000, **settings}))
+    algorithm.prepare(0, tmp_path)
+    assert compiled == expected
+
+
+class Own(nn.Module):
+    """A module of a user, which may do what has no graph."""
+
+
+@pytest.mark.parametrize("part", [None, "model", "policy"])
+def test_with_a_module_of_ones_own_graphs_may_break(tmp_path, monkeypatch, part):
+    given, compile_function = [], torch.compile
+
+    def compiled(function, **settings):
+        given.append(deepcopy(settings))
+        return compile_function(function, **settings)  # it changes them
+
+    monkeypatch.setattr(torch, "compile", compiled)
+    algorithm = make_algorithm(make(BC, tmp_path))
+    if part:
+        getattr(algorithm, part).own = Own()
+    for _ in range(2):
+        compile_and_time(algorithm.loss, "the loss", algorithm)
+    for settings in given:
+        assert ("guard_filter_fn" in settings.get("options", ())) is (part is None)
+        assert settings.get("fullgraph", False) is (part is None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [BC, IQL, TD3BC, CQL, DiscreteCQL])
+def test_compiled_updates_are_the_same(tmp_path, kind, monkeypatch):
+    monkeypatch.setattr(torch._inductor.config, "fallback_random", True)  # the same draws
+    network = tit(2, attention_dropout_outer=0.0, ffn_dropout_inner=0.0)
+    found = []
+    for setting in ("off", "on"):
+        recipe = make(kind, tmp_path, backbone=network, compile=setting)
+        algorithm, batch = double(recipe, tmp_path)
+        torch.manual_seed(1)
+        terms = [algorithm.update(batch.clone(), step) for step in range(3)]
+        found.append((terms, weights_of(algorithm.model)))
+    torch.testing.assert_close(*found, rtol=1e-8, atol=1e-10)

@@ -116,7 +116,8 @@ def test_a_run_of_python_records_what_its_data_said(tmp_path, name):
 
 
 def test_the_measures_of_held_out_episodes(tmp_path):
-    recipe = BC(dataset=str(log_machine(tmp_path / "log.hdf5")), backbone=SMALL, seed=1)
+    data = log_machine(tmp_path / "log.hdf5")
+    recipe = BC(dataset=str(data), backbone=SMALL, seed=1, compile="off")
     algorithm = make_algorithm(recipe)
     algorithm.prepare(0, tmp_path)
     assert algorithm.buffer.storage.shape[0] == 9 * 19  # the final observations are unknown
@@ -146,7 +147,7 @@ def test_episodes_that_are_not_measured_are_not_counted(unfinished, count, tmp_p
 
 def test_no_more_items_are_measured_than_the_limit(tmp_path, monkeypatch):
     data = str(log_machine(tmp_path / "log.hdf5"))
-    recipe = BC(dataset=data, backbone=SMALL, validation_fraction=0.9)
+    recipe = BC(dataset=data, backbone=SMALL, validation_fraction=0.9, compile="off")
     algorithm = make_algorithm(recipe)
     algorithm.prepare(0, tmp_path)
     monkeypatch.setattr("recipes.offline._MOST_MEASURED", 100)
