@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal
 
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
@@ -50,19 +50,6 @@ class ConservativeRecipe(TransitionRecipe):
     """Coefficient of the soft update of the target networks at each gradient step, from 0 to 1."""
     conservative_weight: Weight = 5.0
     """Weight of the conservative term."""
-
-
-RecipeT = TypeVar("RecipeT", bound=ConservativeRecipe)
-
-
-class ConservativeAlgorithm(TransitionAlgorithm[RecipeT]):
-    """What both kinds of conservative Q-learning share.
-
-    Args:
-        recipe: the settings.
-    """
-
-    terminal_observations: ClassVar[Literal["keep", "zero"]] = "zero"  # as in d3rlpy 1.1.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +95,7 @@ class CQL(ConservativeRecipe, algorithm="cql"):
         return CQLAlgorithm(self)
 
 
-class CQLAlgorithm(ConservativeAlgorithm[CQL]):
+class CQLAlgorithm(TransitionAlgorithm[CQL]):
     """Actor on a backbone, two critics and a temperature.
 
     Args:
@@ -122,6 +109,7 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
     # The losses are in the order of the steps: the first that is not finite is the cause.
     columns = ("loss_alpha", "loss_qvalue", "loss_cql", "loss_actor", "alpha", "entropy")
     measures = ("action_error", "q", "advantage", "loss_cql")
+    terminal_observations = "zero"  # as in d3rlpy 1.1.1
     rates: ClassVar = {
         "log_alpha": "temperature_learning_rate",
         "qvalue_network": "critic_learning_rate",
@@ -231,7 +219,7 @@ class DiscreteCQL(ConservativeRecipe, algorithm="discrete-cql"):
         return DiscreteCQLAlgorithm(self)
 
 
-class DiscreteCQLAlgorithm(ConservativeAlgorithm[DiscreteCQL]):
+class DiscreteCQLAlgorithm(TransitionAlgorithm[DiscreteCQL]):
     """A value for each action, on a backbone.
 
     Args:
@@ -243,6 +231,7 @@ class DiscreteCQLAlgorithm(ConservativeAlgorithm[DiscreteCQL]):
 
     columns = ("loss_qvalue", "loss_cql", "value")
     measures = ("action_error", "loss_cql", "value")
+    terminal_observations = "zero"  # as d3rlpy 1.1.1 for continuous actions
     model: DelayedDiscreteCQLLoss
 
     def networks(self, env: EnvBase) -> nn.Module:

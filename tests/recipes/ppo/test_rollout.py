@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
 from torch._dynamo.utils import counters
 from torchrl.modules import RandomPolicy
 from torchrl.objectives.value import GAE
@@ -290,6 +291,7 @@ class Weighed:
     """An algorithm whose loss has a number of its own."""
 
     __module__ = "recipes.ppo"
+    model = policy = nn.Module()
 
     def __init__(self, weight: float) -> None:
         self.weight = weight
