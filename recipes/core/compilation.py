@@ -36,7 +36,8 @@ take its numbers (heads, activations, weights of losses) for its own."""
 
 # Compiling takes about a minute, and each gradient step then saves a few milliseconds.
 _PAYS_FROM = 10_000
-_KNOWN = ("torchrl_tit", "torchrl", "tensordict", "torch")
+# In modules of these packages, only tensors change between calls.
+_KNOWN = {__name__.partition(".")[0], "torchrl_tit", "torchrl", "tensordict", "torch"}
 _COMPILERS = (os.environ.get("CXX", "c++"), "g++", "clang++", "cl")
 
 
@@ -89,9 +90,8 @@ def compile_and_time(function: Callable[P, T], name: str, owner: Algorithm[Any])
         name: what it is, for the message.
         owner: the algorithm that calls it.
     """
-    known = (*_KNOWN, str(__package__).partition(".")[0])
     parts = (owner, *owner.model.modules(), *owner.policy.modules())
-    ours = all(type(part).__module__.partition(".")[0] in known for part in parts)
+    ours = all(type(part).__module__.partition(".")[0] in _KNOWN for part in parts)
     # torch.compile takes the filter out of the options that it is given.
     fast = torch.compile(function, **deepcopy(ONLY_TENSORS if ours else STATIC_SHAPES))
     first = True
